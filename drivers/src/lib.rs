@@ -1,0 +1,36 @@
+//! Devices, recordings and datasets behind a few traits; what comes out is stamped samples.
+
+mod error;
+mod sample;
+
+pub use error::Error;
+pub use sample::{BasePose, Image, PixelFormat, Sample, TruthImage};
+
+use kinematics::{Intrinsics, JointState};
+use std::time::Duration;
+
+/// A live source of images from one camera, real, simulated or replayed.
+pub trait Camera: Send {
+    /// Name in the rig file; also the name of its frame.
+    fn name(&self) -> &str;
+    /// Lens parameters of the colour image.
+    fn intrinsics(&self) -> &Intrinsics;
+    /// Waits for the next image this call has not returned yet, in stamp order; colour and depth are told apart by format.
+    ///
+    /// A slow caller loses the oldest images; the loss is counted in [`Image::n_skipped`].
+    fn next_image(&mut self, timeout: Duration) -> Result<Image, Error>;
+}
+
+/// An arm whose joints can be read.
+pub trait Arm: Send {
+    /// Names of the joints, in the order of the readings.
+    fn joint_names(&self) -> &[String];
+    /// Waits for the next joint state this call has not returned yet.
+    fn read(&mut self, timeout: Duration) -> Result<JointState, Error>;
+}
+
+/// Anything that yields samples of a whole rig in one deterministic order: a recording, a lockstep simulation, live devices.
+pub trait Source: Send {
+    /// The next sample, in stamp order as far as the devices allow; `None` at the end.
+    fn next_sample(&mut self) -> Result<Option<Sample>, Error>;
+}

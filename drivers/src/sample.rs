@@ -1,0 +1,74 @@
+//! What devices deliver.
+
+use kinematics::{JointState, Stamp, Transform};
+use std::sync::Arc;
+
+/// How the bytes of an [`Image`] are to be read.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum PixelFormat {
+    /// Three bytes a pixel, red first.
+    Rgb8,
+    /// One byte a pixel.
+    Gray8,
+    /// A JPEG file as the device sent it.
+    Jpeg,
+    /// A PNG file.
+    Png,
+    /// Depth along the camera's z axis as little-endian 16-bit counts; 0 where the sensor saw nothing.
+    DepthU16 {
+        /// Metres per count.
+        metres_per_count: f64,
+    },
+}
+
+/// One image of one camera, colour or depth.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Image {
+    /// Name of the camera in the rig file.
+    pub camera: Arc<str>,
+    /// Mid-exposure, when the device says so.
+    pub stamp: Stamp,
+    /// Width and height, pixels.
+    pub size_px: [u32; 2],
+    /// How `data` is to be read.
+    pub format: PixelFormat,
+    /// The bytes, row major from the top left.
+    pub data: Arc<[u8]>,
+    /// Exposure time where the device tells it, seconds.
+    pub exposure_secs: Option<f64>,
+    /// Images of this camera and kind lost just before this one.
+    pub n_skipped: u64,
+}
+
+/// Pose of the robot's base at one instant.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BasePose {
+    /// When the base was there.
+    pub stamp: Stamp,
+    /// Pose of the base.
+    pub world_from_base: Transform,
+}
+
+/// What a simulated camera would have seen without noise, blur or shear, and from where.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TruthImage {
+    /// The noise-free image, [`PixelFormat::Rgb8`] or `Png`, same camera and stamp as the noisy one.
+    pub image: Image,
+    /// Noise-free depth along z, metres, `[height, width]`; 0 where nothing is. Empty when not asked for.
+    pub depth_m: Arc<[f32]>,
+    /// True pose of the camera at mid-exposure of the middle row.
+    pub world_from_camera: Transform,
+}
+
+/// One delivery of one device.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Sample {
+    /// Colour or depth.
+    Image(Image),
+    /// Joint readings.
+    Joints(JointState),
+    /// Base pose.
+    Base(BasePose),
+    /// Ground truth of a simulated image.
+    Truth(TruthImage),
+}

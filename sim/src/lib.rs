@@ -1,0 +1,1 @@
+//! Simulated rigs in MuJoCo, behind the traits of `drivers`.

@@ -1,0 +1,3 @@
+//! The `fieldrig` command.
+
+fn main() {}

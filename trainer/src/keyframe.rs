@@ -1,0 +1,79 @@
+//! Posed images accepted for training: plain arrays, no driver types.
+
+use kinematics::{Stamp, Transform, Twist};
+use std::sync::Arc;
+
+/// What a keyframe may be used for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Split {
+    /// Trained on.
+    Train,
+    /// Decides what the model needs; trained on once that is settled.
+    Selection,
+    /// Only reported, decides nothing.
+    Test,
+}
+
+impl Split {
+    /// The split of the `ix`-th keyframe of a camera in order: every 8th from 0 is test, every 8th from 4 selection.
+    pub fn of(ix: usize) -> Self {
+        match ix % 8 {
+            0 => Self::Test,
+            4 => Self::Selection,
+            _ => Self::Train,
+        }
+    }
+}
+
+/// One posed image, undistorted, at its own size.
+#[derive(Clone, Debug)]
+pub struct Keyframe {
+    /// Name of the camera.
+    pub camera: Arc<str>,
+    /// Mid-exposure of the middle row.
+    pub stamp: Stamp,
+    /// Width and height, pixels.
+    pub size_px: [u32; 2],
+    /// Focal length of the undistorted image, pixels.
+    pub focal_px: [f64; 2],
+    /// Principal point of the undistorted image, pixels.
+    pub principal_px: [f64; 2],
+    /// `[height, width, 4]`, sRGB; alpha 255 where the pixel was seen, 0 where undistortion or a mask left nothing.
+    pub rgba_srgb: Arc<[u8]>,
+    /// Depth, where the camera has it.
+    pub depth: Option<DepthMap>,
+    /// Pose at `stamp`.
+    pub world_from_camera: Transform,
+    /// Velocity of the camera at `stamp`, where known; used with `readout_secs`.
+    pub twist: Option<Twist>,
+    /// Time from the first row's exposure to the last row's, seconds; 0 for a global shutter.
+    pub readout_secs: f64,
+    /// What it may be used for.
+    pub split: Split,
+    /// What a simulator knows.
+    pub truth: Option<Truth>,
+}
+
+/// Depth along a camera's z axis with its own size, lens and pose.
+#[derive(Clone, Debug)]
+pub struct DepthMap {
+    /// Width and height, pixels.
+    pub size_px: [u32; 2],
+    /// Focal length, pixels.
+    pub focal_px: [f64; 2],
+    /// Principal point, pixels.
+    pub principal_px: [f64; 2],
+    /// `[height, width]`, metres along z; 0 where the sensor saw nothing.
+    pub depth_m: Arc<[f32]>,
+    /// Pose at the stamp of the depth image.
+    pub world_from_camera: Transform,
+}
+
+/// The noise-free image and the true pose, from a simulator.
+#[derive(Clone, Debug)]
+pub struct Truth {
+    /// `[height, width, 4]`, sRGB, no noise.
+    pub rgba_srgb: Arc<[u8]>,
+    /// True pose at the keyframe's stamp.
+    pub world_from_camera: Transform,
+}

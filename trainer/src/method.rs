@@ -1,0 +1,37 @@
+//! What every scene model can do.
+
+use crate::{Error, Keyframe, Picture, RenderRequest};
+use kinematics::Stamp;
+use std::path::Path;
+use std::sync::Arc;
+
+/// Where training stands.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Progress {
+    /// Optimiser updates so far.
+    pub step: u64,
+    /// Splats, voxel blocks or table entries.
+    pub primitives: u64,
+    /// Bytes of GPU memory the model holds.
+    pub bytes: u64,
+    /// GPU time of a step, milliseconds, smoothed.
+    pub step_millis: f64,
+}
+
+/// One scene model that learns from keyframes.
+///
+/// Several models can share one device; each is owned by one thread.
+pub trait Method {
+    /// Adds a keyframe. Test keyframes are evaluated, never trained on.
+    fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error>;
+    /// Forgets the keyframe of this camera and stamp, if it is held.
+    fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error>;
+    /// Queues at most `n` optimiser updates, few enough to hold the GPU for no more than 20 ms, and says how many.
+    fn step(&mut self, n: u64) -> Result<u64, Error>;
+    /// Draws a picture; works from the first keyframe on.
+    fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error>;
+    /// Where training stands.
+    fn progress(&self) -> Progress;
+    /// Writes the model into a folder.
+    fn save(&mut self, folder: &Path) -> Result<(), Error>;
+}

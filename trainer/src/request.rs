@@ -1,0 +1,58 @@
+//! Requests for pictures of the model, and the pictures.
+
+use kinematics::Transform;
+
+/// A box with sides along the axes of the frame it is given in, metres.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Aabb {
+    /// Pose of the box's frame.
+    pub world_from_box: Transform,
+    /// Corner with the smallest coordinates.
+    pub min_m: [f64; 3],
+    /// Corner with the largest coordinates.
+    pub max_m: [f64; 3],
+}
+
+/// How directions map to pixels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Projection {
+    /// Pinhole with focal length and principal point in pixels of the full size.
+    Pinhole {
+        /// Focal length, pixels.
+        focal_px: [f64; 2],
+        /// Principal point, pixels.
+        principal_px: [f64; 2],
+    },
+    /// All directions: longitude along x from -180 to 180 degrees, latitude along y from up to down, centre forward.
+    Equirectangular,
+}
+
+/// What to draw.
+#[derive(Clone, Debug)]
+pub struct RenderRequest {
+    /// Pose of the virtual camera.
+    pub world_from_camera: Transform,
+    /// Width and height, pixels.
+    pub size_px: [u32; 2],
+    /// How directions map to pixels.
+    pub projection: Projection,
+    /// Nothing nearer than this along z is drawn, metres.
+    pub near_m: f64,
+    /// Nothing further than this is drawn, metres.
+    pub far_m: f64,
+    /// Only what lies inside is drawn.
+    pub crop: Option<Aabb>,
+    /// Colour behind everything, sRGB 0 to 1.
+    pub background_srgb: [f32; 3],
+}
+
+/// A drawn picture.
+#[derive(Clone, Debug)]
+pub struct Picture {
+    /// Width and height, pixels.
+    pub size_px: [u32; 2],
+    /// `[height, width, 4]`, sRGB over the background; alpha is coverage.
+    pub rgba_srgb: Vec<u8>,
+    /// `[height, width]`, metres along z (distance for equirectangular); 0 where nothing is.
+    pub depth_m: Vec<f32>,
+}

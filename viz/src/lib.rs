@@ -1,0 +1,1 @@
+//! The operator's window: a render server and its web page.
