@@ -58,6 +58,8 @@ pub struct TruthImage {
     pub depth_m: Arc<[f32]>,
     /// True pose of the camera at mid-exposure of the middle row.
     pub world_from_camera: Transform,
+    /// PSNR, dB, of the delivered image against the same image, shear and blur kept, before its noise; `None` without noise.
+    pub psnr_ceiling: Option<f64>,
 }
 
 /// One delivery of one device.
