@@ -2,8 +2,13 @@
 
 mod error;
 pub mod keyframe;
+pub mod loss;
 pub mod method;
+#[cfg(test)]
+mod mismatches;
+pub mod optim;
 pub mod request;
+pub mod splat;
 
 pub use error::Error;
 pub use keyframe::{DepthMap, Keyframe, Split, Truth};

@@ -1,0 +1,3 @@
+//! How far a rendered image is from a keyframe.
+
+pub mod reference;

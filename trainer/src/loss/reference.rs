@@ -1,0 +1,323 @@
+//! The plain CPU version of the training loss in f64: absolute difference, structure (SSIM) and depth, with gradients.
+//!
+//! Source: Kerbl et al. 2023, equation 7; SSIM of Wang et al. 2004 with a Gaussian window. We divide by all pixels, seen
+//! or not, and our depth residual is not divided by the coverage, so that it stays linear in the image.
+
+use crate::splat::reference::{RenderedImage, Upstream};
+
+/// Pixels of the SSIM window to either side of its center.
+pub const WINDOW_RADIUS: usize = 5;
+/// Standard deviation of the SSIM window, pixels.
+pub const WINDOW_SIGMA_PX: f64 = 1.5;
+const C1: f64 = 0.01 * 0.01;
+const C2: f64 = 0.03 * 0.03;
+
+/// What the render should look like, row by row.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Target {
+    /// Width and height, pixels.
+    pub size_px: [usize; 2],
+    /// Color, 0 to 1.
+    pub rgb: Vec<[f64; 3]>,
+    /// Which pixels have a color; the others say nothing about color, but may have a depth.
+    pub seen: Vec<bool>,
+    /// Depth along z, metres; 0 where there is none. Empty where the camera has no depth.
+    pub depth_m: Vec<f64>,
+}
+
+/// How much each part of the loss counts.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Weights {
+    /// Share of the structure term in the color loss; the rest is the absolute difference.
+    pub dssim_frac: f64,
+    /// Weight of the depth term, per metre.
+    pub depth_per_m: f64,
+    /// Depth residuals beyond this pull no more, metres.
+    pub depth_clip_m: f64,
+    /// Color behind the splats.
+    pub background_rgb: [f64; 3],
+}
+
+/// The loss of one image and its parts before weighting.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Loss {
+    /// `(1 - dssim_frac) * l1 + dssim_frac * dssim + depth_per_m * depth_m`.
+    pub total: f64,
+    /// Mean absolute difference of the colors.
+    pub l1: f64,
+    /// One minus the mean SSIM.
+    pub dssim: f64,
+    /// Mean clipped residual of depth, metres.
+    pub depth_m: f64,
+}
+
+/// Loss of a rendered image, and its gradient by the image.
+pub fn loss(image: &RenderedImage, target: &Target, weights: &Weights) -> (Loss, Upstream) {
+    let n_pixels = target.rgb.len();
+    let (rendered, truth) = (composed(image, target, weights), masked(&target.rgb, target));
+    let mut upstream =
+        Upstream { rgb: vec![[0.0; 3]; n_pixels], transmittance: vec![0.0; n_pixels], depth: vec![0.0; n_pixels] };
+    let mut loss = Loss::default();
+    for channel in 0..3 {
+        let plane = |pixels: &[[f64; 3]]| pixels.iter().map(|pixel| pixel[channel]).collect::<Vec<_>>();
+        let (rendered, truth) = (plane(&rendered), plane(&truth));
+        let (l1, v_l1) = mean_abs(&rendered, &truth);
+        let (ssim, v_ssim) = mean_ssim(target.size_px, &rendered, &truth);
+        loss.l1 += l1 / 3.0;
+        loss.dssim += (1.0 - ssim) / 3.0;
+        for pixel_ix in (0..n_pixels).filter(|&pixel_ix| target.seen[pixel_ix]) {
+            let v = ((1.0 - weights.dssim_frac) * v_l1[pixel_ix] - weights.dssim_frac * v_ssim[pixel_ix]) / 3.0;
+            upstream.rgb[pixel_ix][channel] = v;
+            upstream.transmittance[pixel_ix] += v * weights.background_rgb[channel];
+        }
+    }
+    loss.depth_m = depth(image, target, weights, &mut upstream);
+    loss.total =
+        (1.0 - weights.dssim_frac) * loss.l1 + weights.dssim_frac * loss.dssim + weights.depth_per_m * loss.depth_m;
+    (loss, upstream)
+}
+
+/// Mean absolute difference and its gradient by `rendered`; 0 where the two are equal.
+fn mean_abs(rendered: &[f64], truth: &[f64]) -> (f64, Vec<f64>) {
+    let n_pixels = rendered.len() as f64;
+    let residuals = rendered.iter().zip(truth).map(|(rendered, truth)| rendered - truth);
+    (residuals.clone().map(f64::abs).sum::<f64>() / n_pixels, residuals.map(|r| sign(r) / n_pixels).collect())
+}
+
+/// Mean SSIM over all pixels of one channel and its gradient by `rendered`; both images are 0 outside their borders.
+pub fn mean_ssim(size_px: [usize; 2], rendered: &[f64], truth: &[f64]) -> (f64, Vec<f64>) {
+    let n_pixels = rendered.len() as f64;
+    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).collect::<Vec<_>>();
+    let blurred = |plane: &[f64]| blurred(size_px, plane);
+    let (mean_x, mean_y) = (blurred(rendered), blurred(truth));
+    let mean_xx = blurred(&product(rendered, rendered));
+    let mean_yy = blurred(&product(truth, truth));
+    let mean_xy = blurred(&product(rendered, truth));
+
+    let mut sum = 0.0;
+    let (mut v_mean_x, mut v_mean_xx, mut v_mean_xy) = (Vec::new(), Vec::new(), Vec::new());
+    for ix in 0..rendered.len() {
+        let (x, y) = (mean_x[ix], mean_y[ix]);
+        let luminance = (2.0 * x * y + C1, x * x + y * y + C1);
+        let contrast = (2.0 * (mean_xy[ix] - x * y) + C2, mean_xx[ix] - x * x + mean_yy[ix] - y * y + C2);
+        let below = luminance.1 * contrast.1;
+        let ssim = luminance.0 * contrast.0 / below;
+        sum += ssim;
+        // The variances hold the mean too, so the mean is reached on three ways.
+        let (v_variance, v_covariance) = (-ssim / contrast.1, 2.0 * luminance.0 / below);
+        let v_luminance = 2.0 * y * contrast.0 / below - 2.0 * x * ssim / luminance.1;
+        v_mean_x.push((v_luminance - 2.0 * x * v_variance - y * v_covariance) / n_pixels);
+        v_mean_xx.push(v_variance / n_pixels);
+        v_mean_xy.push(v_covariance / n_pixels);
+    }
+    // The window is symmetric, so blurring is its own transpose.
+    let (by_mean, by_square, by_product) = (blurred(&v_mean_x), blurred(&v_mean_xx), blurred(&v_mean_xy));
+    let v = (0..rendered.len()).map(|ix| by_mean[ix] + 2.0 * rendered[ix] * by_square[ix] + truth[ix] * by_product[ix]);
+    (sum / n_pixels, v.collect())
+}
+
+/// Mean clipped residual of depth over all pixels; adds its weighted gradient to `upstream`.
+fn depth(image: &RenderedImage, target: &Target, weights: &Weights, upstream: &mut Upstream) -> f64 {
+    let n_pixels = target.rgb.len() as f64;
+    let mut sum = 0.0;
+    for (pixel_ix, &depth_m) in target.depth_m.iter().enumerate().filter(|(_, depth_m)| **depth_m > 0.0) {
+        // What the render's share of the pixel weighs, against the same share of the true depth.
+        let residual_m = image.depth[pixel_ix] - (1.0 - image.transmittance[pixel_ix]) * depth_m;
+        sum += residual_m.abs().min(weights.depth_clip_m);
+        if residual_m.abs() < weights.depth_clip_m {
+            let v = weights.depth_per_m * sign(residual_m) / n_pixels;
+            upstream.depth[pixel_ix] += v;
+            upstream.transmittance[pixel_ix] += v * depth_m;
+        }
+    }
+    sum / n_pixels
+}
+
+/// The render over the background, black where the target is not seen.
+fn composed(image: &RenderedImage, target: &Target, weights: &Weights) -> Vec<[f64; 3]> {
+    let over = |(rgb, transmittance): (&[f64; 3], &f64)| {
+        std::array::from_fn(|channel| rgb[channel] + transmittance * weights.background_rgb[channel])
+    };
+    masked(&image.rgb.iter().zip(&image.transmittance).map(over).collect::<Vec<_>>(), target)
+}
+
+fn masked(rgb: &[[f64; 3]], target: &Target) -> Vec<[f64; 3]> {
+    rgb.iter().zip(&target.seen).map(|(rgb, seen)| if *seen { *rgb } else { [0.0; 3] }).collect()
+}
+
+/// Weights of the SSIM window along one axis; they sum to 1.
+pub fn window() -> [f64; 2 * WINDOW_RADIUS + 1] {
+    let weights: [f64; 2 * WINDOW_RADIUS + 1] = std::array::from_fn(|ix| {
+        let offset = ix as f64 - WINDOW_RADIUS as f64;
+        (-0.5 * (offset / WINDOW_SIGMA_PX).powi(2)).exp()
+    });
+    let sum: f64 = weights.iter().sum();
+    weights.map(|weight| weight / sum)
+}
+
+/// Convolution with the window along x, then along y; 0 outside the borders.
+fn blurred(size_px: [usize; 2], plane: &[f64]) -> Vec<f64> {
+    let [width, height] = size_px;
+    let window = window();
+    let along = |plane: &[f64], stride: usize, ix: usize, place: usize, side: usize| -> f64 {
+        let first = WINDOW_RADIUS.saturating_sub(place);
+        let end = window.len().min(side + WINDOW_RADIUS - place);
+        (first..end).map(|tap| window[tap] * plane[ix + stride * tap - stride * WINDOW_RADIUS]).sum()
+    };
+    let by_x: Vec<_> = (0..plane.len()).map(|ix| along(plane, 1, ix, ix % width, width)).collect();
+    (0..plane.len()).map(|ix| along(&by_x, width, ix, ix / width, height)).collect()
+}
+
+/// -1, 0 or 1.
+fn sign(value: f64) -> f64 {
+    if value == 0.0 { 0.0 } else { value.signum() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mismatches::Mismatches;
+    use crate::splat::reference::scene::Random;
+
+    const SIZE_PX: [usize; 2] = [17, 14];
+    const N_PIXELS: usize = SIZE_PX[0] * SIZE_PX[1];
+    const WEIGHTS: Weights =
+        Weights { dssim_frac: 0.2, depth_per_m: 0.5, depth_clip_m: 0.3, background_rgb: [0.3, 0.6, 0.1] };
+
+    /// A render and a target that differ, with unseen pixels, pixels without depth, and depths far off; no residual
+    /// lies near zero or near the clip.
+    fn image_and_target() -> (RenderedImage, Target) {
+        let mut random = Random::new(11);
+        let mut image = RenderedImage::default();
+        let mut target = Target { size_px: SIZE_PX, ..Target::default() };
+        for pixel_ix in 0..N_PIXELS {
+            let truth = random.array(0.2, 0.8);
+            let transmittance = random.uniform(0.05, 0.6);
+            let depth_m = if pixel_ix % 5 == 0 { 0.0 } else { random.uniform(0.5, 3.0) };
+            let offset = |random: &mut Random| {
+                random.uniform(0.02, 0.2) * if random.uniform(0.0, 1.0) < 0.5 { -1.0 } else { 1.0 }
+            };
+            let rgb = truth.map(|truth: f64| truth + offset(&mut random));
+            image.rgb.push(std::array::from_fn(|c| rgb[c] - transmittance * WEIGHTS.background_rgb[c]));
+            image.transmittance.push(transmittance);
+            let residual_m = if pixel_ix % 7 == 0 { 0.8 } else { offset(&mut random) };
+            image.depth.push((1.0 - transmittance) * depth_m + residual_m);
+            image.last_contributor.push(None);
+            target.rgb.push(truth);
+            target.seen.push(pixel_ix % 11 != 3 && pixel_ix % SIZE_PX[0] != 2);
+            target.depth_m.push(depth_m);
+        }
+        (image, target)
+    }
+
+    /// Compares the gradient, times `factor`, with central differences; numbers without influence are left out.
+    fn checked_gradient(factor: f64) -> Mismatches {
+        const NUDGE: f64 = 1e-5;
+        const ABS: f64 = 1e-10; // Rounding of a loss of about 1, divided by the nudge.
+        const REL: f64 = 1e-6;
+        let (image, target) = image_and_target();
+        let (_, upstream) = loss(&image, &target, &WEIGHTS);
+        let mut wrong = Mismatches::default();
+        let mut check = |name: String, analytic: f64, nudge: &dyn Fn(&mut RenderedImage, f64)| {
+            let at = |step| {
+                let mut image = image.clone();
+                nudge(&mut image, step);
+                loss(&image, &target, &WEIGHTS).0.total
+            };
+            let numeric = (at(NUDGE) - at(-NUDGE)) / (2.0 * NUDGE);
+            if (analytic, numeric) != (0.0, 0.0) {
+                wrong.check(name, analytic * factor, numeric, ABS, REL);
+            }
+        };
+        for ix in 0..N_PIXELS {
+            for c in 0..3 {
+                check(format!("rgb {ix} {c}"), upstream.rgb[ix][c], &|image, step| image.rgb[ix][c] += step);
+            }
+            check(format!("transmittance {ix}"), upstream.transmittance[ix], &|image, step| {
+                image.transmittance[ix] += step;
+            });
+            check(format!("depth {ix}"), upstream.depth[ix], &|image, step| image.depth[ix] += step);
+        }
+        wrong
+    }
+
+    #[test]
+    fn gradient_matches_central_differences() {
+        checked_gradient(1.0).assert_none();
+    }
+
+    #[test]
+    fn a_gradient_off_by_a_part_in_ten_thousand_is_noticed() {
+        let n_wrong = checked_gradient(1.0001).n_wrong();
+        assert!(n_wrong > 4 * N_PIXELS * 8 / 10, "only {n_wrong} of about {} are noticed", 4 * N_PIXELS);
+    }
+
+    #[test]
+    fn ssim_agrees_with_its_definition_written_out() {
+        let (image, target) = image_and_target();
+        let plane = |pixels: &[[f64; 3]]| pixels.iter().map(|pixel| pixel[1]).collect::<Vec<_>>();
+        let (x, y) = (plane(&image.rgb), plane(&target.rgb));
+        let weight = |dx: i32, dy: i32| (-f64::from(dx * dx + dy * dy) / (2.0 * 1.5 * 1.5)).exp();
+        let total: f64 = (-5..=5).flat_map(|dy| (-5..=5).map(move |dx| weight(dx, dy))).sum();
+        let (width, height) = (17_i32, 14_i32);
+        let at = |plane: &[f64], column: i32, row: i32| {
+            let inside = (0..width).contains(&column) && (0..height).contains(&row);
+            if inside { plane[usize::try_from(row * width + column).expect("inside")] } else { 0.0 }
+        };
+        let mut sum = 0.0;
+        for (row, column) in (0..height).flat_map(|row| (0..width).map(move |column| (row, column))) {
+            let mean = |value: &dyn Fn(i32, i32) -> f64| -> f64 {
+                let window = (-5..=5).flat_map(|dy| (-5..=5).map(move |dx| (dx, dy)));
+                window.map(|(dx, dy)| weight(dx, dy) / total * value(column + dx, row + dy)).sum()
+            };
+            let (mx, my) = (mean(&|c, r| at(&x, c, r)), mean(&|c, r| at(&y, c, r)));
+            let vx = mean(&|c, r| (at(&x, c, r) - mx).powi(2));
+            let vy = mean(&|c, r| (at(&y, c, r) - my).powi(2));
+            let vxy = mean(&|c, r| (at(&x, c, r) - mx) * (at(&y, c, r) - my));
+            sum +=
+                (2.0 * mx * my + 0.0001) * (2.0 * vxy + 0.0009) / ((mx * mx + my * my + 0.0001) * (vx + vy + 0.0009));
+        }
+        let (got, _) = mean_ssim(SIZE_PX, &x, &y);
+        assert!((got - sum / f64::from(width * height)).abs() < 1e-12, "{got}");
+    }
+
+    #[test]
+    fn a_perfect_render_costs_nothing_and_unseen_pixels_pull_at_nothing() {
+        let (mut image, target) = image_and_target();
+        let (_, upstream) = loss(&image, &target, &WEIGHTS);
+        for ix in (0..N_PIXELS).filter(|&ix| !target.seen[ix]) {
+            assert_eq!(upstream.rgb[ix], [0.0; 3]);
+        }
+        for ix in 0..N_PIXELS {
+            let transmittance = image.transmittance[ix];
+            image.depth[ix] = (1.0 - transmittance) * target.depth_m[ix];
+            if target.seen[ix] {
+                image.rgb[ix] = std::array::from_fn(|c| target.rgb[ix][c] - transmittance * WEIGHTS.background_rgb[c]);
+            }
+        }
+        let (perfect, _) = loss(&image, &target, &WEIGHTS);
+        assert!(perfect.total.abs() < 1e-12, "{perfect:?}");
+    }
+
+    #[test]
+    fn known_values_of_a_flat_image() {
+        // A render 0.25 too bright everywhere, seen fully; one pixel's depth 0.1 m off, another's beyond the clip.
+        let n = N_PIXELS;
+        let mut depth_m = vec![0.0; n];
+        (depth_m[3], depth_m[4]) = (2.0, 2.0);
+        let target = Target { size_px: SIZE_PX, rgb: vec![[0.5; 3]; n], seen: vec![true; n], depth_m };
+        let mut depth = vec![0.0; n];
+        (depth[3], depth[4]) = (2.1, 1.0);
+        let image = RenderedImage {
+            rgb: vec![[0.75; 3]; n],
+            transmittance: vec![0.0; n],
+            depth,
+            last_contributor: vec![None; n],
+        };
+        let (loss, upstream) = loss(&image, &target, &WEIGHTS);
+        assert!((loss.l1 - 0.25).abs() < 1e-12);
+        assert!((loss.depth_m - (0.1 + 0.3) / n as f64).abs() < 1e-12, "{}", loss.depth_m);
+        assert!((upstream.depth[3] - 0.5 / n as f64).abs() < 1e-15);
+        assert_eq!(upstream.depth[4], 0.0);
+    }
+}

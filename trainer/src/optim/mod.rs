@@ -1,0 +1,3 @@
+//! Steps of the optimiser.
+
+pub mod reference;

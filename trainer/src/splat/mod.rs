@@ -1,0 +1,3 @@
+//! Scenes of 3D Gaussians.
+
+pub mod reference;

@@ -1,0 +1,195 @@
+//! The plain CPU version of splatting in f64: what every kernel of `splat` is compared with.
+//!
+//! `project` places each splat on the image plane, `rasterize` composites the splats pixel by pixel, and each has a
+//! backward function. Whatever is decided by comparing numbers (who is seen, in which order, who adds to which pixel)
+//! is decided once, in [`decide`], and held while gradients are taken.
+//!
+//! Source: Kerbl et al. 2023 (3D Gaussian splatting) and Ye et al. 2024 (gsplat, appendix on gradients). We differ in
+//! the rolling shutter, and in a depth output that is composited like a color.
+
+pub mod project;
+pub mod rasterize;
+pub mod sh;
+
+#[cfg(test)]
+mod published_picture;
+#[cfg(test)]
+pub mod scene;
+#[cfg(test)]
+mod tests;
+
+use kinematics::Transform;
+pub use project::{project, project_backward};
+pub use rasterize::{Decisions, decide};
+
+/// Raw, optimised values of one splat.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Splat {
+    /// Center in world, metres.
+    pub mean: [f64; 3],
+    /// Natural logarithm of the standard deviations along the splat's own axes, in metres before the logarithm.
+    pub log_scale: [f64; 3],
+    /// `world_from_splat` rotation; any length but zero, normalised where it is used.
+    pub rotation_wxyz: [f64; 4],
+    /// Opacity before the sigmoid.
+    pub opacity_logit: f64,
+    /// `[(degree + 1)^2, 3]` spherical-harmonic coefficients of the color minus one half, constant term first.
+    pub sh: Vec<[f64; 3]>,
+}
+
+/// Gradient of a loss by the raw values of one splat, in the shape of the splat.
+pub type SplatGrad = Splat;
+
+/// One camera at one moment, with its motion while the image is read out.
+#[derive(Clone, Debug, PartialEq)]
+pub struct View {
+    /// Pose at the middle row's exposure.
+    pub camera_from_world: Transform,
+    /// Focal length, pixels.
+    pub focal_px: [f64; 2],
+    /// Principal point, pixels; the center of pixel `(0, 0)` is `(0.5, 0.5)`.
+    pub principal_px: [f64; 2],
+    /// Width and height, pixels.
+    pub size_px: [u32; 2],
+    /// Splats nearer than this along z are not seen, metres.
+    pub near_m: f64,
+    /// Motion of the camera over the whole readout in its own axes, metres: linear velocity times readout time.
+    pub linear_m: [f64; 3],
+    /// Rotation of the camera over the whole readout in its own axes, radians: angular velocity times readout time.
+    pub angular_rad: [f64; 3],
+}
+
+impl View {
+    /// How many pixels the image has.
+    pub fn n_pixels(&self) -> usize {
+        self.size_px.iter().map(|&side| side as usize).product()
+    }
+
+    /// Centers of the pixels, row by row.
+    pub fn pixel_centers(&self) -> impl Iterator<Item = [f64; 2]> {
+        let [width, height] = self.size_px;
+        (0..height).flat_map(move |row| (0..width).map(move |column| [f64::from(column) + 0.5, f64::from(row) + 0.5]))
+    }
+}
+
+/// Gradient of a loss by a view.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ViewGrad {
+    /// By a small motion `exp(pose) * camera_from_world`: translation in metres, then rotation in radians.
+    pub pose: [f64; 6],
+    /// By [`View::linear_m`].
+    pub linear_m: [f64; 3],
+    /// By [`View::angular_rad`].
+    pub angular_rad: [f64; 3],
+}
+
+/// A splat on the image plane.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Projected {
+    /// Center, pixels.
+    pub mean_px: [f64; 2],
+    /// Inverse of the 2D covariance `[[a, b], [b, c]]` as `[a, b, c]`, per square pixel.
+    pub conic: [f64; 3],
+    /// Opacity at the center, 0 to 1.
+    pub opacity: f64,
+    /// Color as seen from the camera, not below 0.
+    pub color: [f64; 3],
+    /// Depth of the center along the camera's z axis, metres.
+    pub depth: f64,
+    /// Half sides of the box round `mean_px` outside which the splat adds nothing, pixels.
+    pub extent_px: [f64; 2],
+}
+
+/// Gradient of a loss by a [`Projected`]; the extent decides nothing and has none.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ProjectedGrad {
+    /// By the center.
+    pub mean_px: [f64; 2],
+    /// By the three numbers of the conic; `b` stands for both off-diagonal entries.
+    pub conic: [f64; 3],
+    /// By the opacity.
+    pub opacity: f64,
+    /// By the color.
+    pub color: [f64; 3],
+    /// By the depth.
+    pub depth: f64,
+}
+
+/// What a render gives, row by row.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RenderedImage {
+    /// Color of the splats alone, premultiplied; no background.
+    pub rgb: Vec<[f64; 3]>,
+    /// Share of the background that shows, 0 to 1.
+    pub transmittance: Vec<f64>,
+    /// Depths along z weighted as the colors are, metres; divide by `1 - transmittance` for a mean depth.
+    pub depth: Vec<f64>,
+    /// The last splat, by index, that was added to the pixel.
+    pub last_contributor: Vec<Option<usize>>,
+}
+
+/// Gradient of a loss by a [`RenderedImage`], row by row.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Upstream {
+    /// By the color.
+    pub rgb: Vec<[f64; 3]>,
+    /// By the transmittance.
+    pub transmittance: Vec<f64>,
+    /// By the depth.
+    pub depth: Vec<f64>,
+}
+
+/// Gradient of a loss by everything a render is made of.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RenderGrad {
+    /// By the raw values of each splat; zero for splats that are not seen.
+    pub splats: Vec<SplatGrad>,
+    /// By each splat on the image plane; zero for splats that are not seen.
+    pub projected: Vec<ProjectedGrad>,
+    /// By the view.
+    pub view: ViewGrad,
+}
+
+/// Draws the splats.
+pub fn render(view: &View, splats: &[Splat]) -> RenderedImage {
+    render_decided(view, splats, &decide(view, splats))
+}
+
+/// Draws the splats with decisions taken before, so that a nudged splat can be compared with itself.
+pub fn render_decided(view: &View, splats: &[Splat], decisions: &Decisions) -> RenderedImage {
+    rasterize::composite(view, &project_decided(view, splats, decisions), decisions)
+}
+
+/// Gradient of a loss by every splat and by the view, from its gradient by the image.
+pub fn render_backward(view: &View, splats: &[Splat], upstream: &Upstream) -> RenderGrad {
+    let decisions = decide(view, splats);
+    let projected = project_decided(view, splats, &decisions);
+    let by_projected = rasterize::composite_backward(view, &projected, &decisions, upstream);
+    let mut grad = RenderGrad { projected: by_projected, ..RenderGrad::default() };
+    for (splat_ix, splat) in splats.iter().enumerate() {
+        let Some(row_share) = decisions.row_shares[splat_ix] else {
+            grad.splats.push(SplatGrad { sh: vec![[0.0; 3]; splat.sh.len()], ..SplatGrad::default() });
+            continue;
+        };
+        let (by_splat, by_view) = project_backward(view, splat, row_share, &grad.projected[splat_ix]);
+        grad.splats.push(by_splat);
+        grad.view.add(&by_view);
+    }
+    grad
+}
+
+fn project_decided(view: &View, splats: &[Splat], decisions: &Decisions) -> Vec<Projected> {
+    let place = |(splat, row_share): (&Splat, &Option<f64>)| {
+        row_share.map(|row_share| project::project_at(view, splat, row_share)).unwrap_or_default()
+    };
+    splats.iter().zip(&decisions.row_shares).map(place).collect()
+}
+
+impl ViewGrad {
+    fn add(&mut self, other: &Self) {
+        let sum = |to: &mut [f64], from: &[f64]| to.iter_mut().zip(from).for_each(|(to, from)| *to += from);
+        sum(&mut self.pose, &other.pose);
+        sum(&mut self.linear_m, &other.linear_m);
+        sum(&mut self.angular_rad, &other.angular_rad);
+    }
+}

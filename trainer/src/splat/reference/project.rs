@@ -1,0 +1,253 @@
+//! Placing one splat on the image plane, and the gradient of that.
+//!
+//! Source: Zwicker et al. 2001 (EWA splatting); the Jacobian's clamp is that of gsplat (Ye et al. 2024). A rolling
+//! shutter moves the splat by its row's share of the readout; the share is held constant in the gradient.
+
+use super::{Projected, ProjectedGrad, Splat, SplatGrad, View, ViewGrad, sh};
+use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
+
+/// Least share of a pixel that is still drawn.
+pub const MIN_ALPHA: f64 = 1.0 / 255.0;
+/// Added to both variances on the image plane so that no splat falls between pixels, square pixels.
+pub const BLUR_PX2: f64 = 0.3;
+/// The Jacobian is held constant beyond this share of half the image outside its border.
+const MARGIN_FRAC: f64 = 0.3;
+
+/// Places a splat on the image plane; `None` where it is nearer than `near_m` or too faint to draw.
+///
+/// A splat beside the image is placed too: whoever asks for its pixels finds none.
+pub fn project(view: &View, splat: &Splat) -> Option<Projected> {
+    let projected = project_at(view, splat, row_share(view, splat));
+    // Written so that a NaN is not seen.
+    (projected.depth >= view.near_m && projected.opacity >= MIN_ALPHA).then_some(projected)
+}
+
+/// When the splat's row is read, as a share of the readout: -0.5 for the first row, 0.5 for the last.
+///
+/// The row is that of the camera's pose at the middle row, without motion.
+pub fn row_share(view: &View, splat: &Splat) -> f64 {
+    let point_in_camera = view.camera_from_world * nalgebra::Point3::from(splat.mean);
+    let row_px = view.focal_px[1] * point_in_camera.y / point_in_camera.z + view.principal_px[1];
+    (row_px / f64::from(view.size_px[1])).clamp(0.0, 1.0) - 0.5
+}
+
+/// Places a splat whose row is read at `row_share`, seen or not.
+pub fn project_at(view: &View, splat: &Splat, row_share: f64) -> Projected {
+    let parts = Parts::new(view, splat, row_share);
+    let [fx, fy] = view.focal_px;
+    let [cx, cy] = view.principal_px;
+    let point = parts.point_in_camera;
+    let opacity = sigmoid(splat.opacity_logit);
+    let reach = (2.0 * (opacity / MIN_ALPHA).ln()).max(0.0).sqrt(); // Standard deviations until alpha is MIN_ALPHA.
+    Projected {
+        mean_px: [fx * point.x / point.z + cx, fy * point.y / point.z + cy],
+        conic: [parts.conic[(0, 0)], parts.conic[(0, 1)], parts.conic[(1, 1)]],
+        opacity,
+        color: sh::color(&splat.sh, &offset_in_world(view, splat)),
+        depth: point.z,
+        extent_px: [reach * parts.cov_px2[(0, 0)].sqrt(), reach * parts.cov_px2[(1, 1)].sqrt()],
+    }
+}
+
+/// Gradient by the splat's raw values and by the view, from the gradient by the placed splat.
+pub fn project_backward(view: &View, splat: &Splat, row_share: f64, v: &ProjectedGrad) -> (SplatGrad, ViewGrad) {
+    let parts = Parts::new(view, splat, row_share);
+    let camera_from_world = view.camera_from_world.rotation.to_rotation_matrix().into_inner();
+
+    let (v_sh, v_offset) = sh::color_backward(&splat.sh, &offset_in_world(view, splat), &v.color);
+    let opacity = sigmoid(splat.opacity_logit);
+
+    // From the conic down to the map of the splat's axes onto the image.
+    let v_conic = Matrix2::new(v.conic[0], 0.5 * v.conic[1], 0.5 * v.conic[1], v.conic[2]);
+    let v_cov = -parts.conic * v_conic * parts.conic;
+    let v_image_from_world = 2.0 * v_cov * parts.image_from_world * parts.cov_in_world;
+    let v_jacobian = v_image_from_world * parts.moved_from_world.transpose();
+    let v_moved_from_world = parts.jacobian.transpose() * v_image_from_world;
+    let v_cov_in_world = parts.image_from_world.transpose() * v_cov * parts.image_from_world;
+    let (v_log_scale, v_rotation_wxyz) = shape_backward(splat, &v_cov_in_world);
+
+    // From the image down to the point in the camera as its row sees it, then as the middle row would.
+    let mut v_point =
+        pinhole_backward(view, &parts.point_in_camera, &v.mean_px) + jacobian_backward(view, &parts, &v_jacobian);
+    v_point.z += v.depth;
+    let v_still_point = parts.moved_from_still.transpose() * v_point;
+    let v_camera_from_world = parts.moved_from_still.transpose() * v_moved_from_world;
+    let v_moved_from_still =
+        v_moved_from_world * camera_from_world.transpose() + v_point * parts.still_point.transpose();
+
+    let by_splat = SplatGrad {
+        mean: (camera_from_world.transpose() * v_still_point + v_offset).into(),
+        log_scale: v_log_scale,
+        rotation_wxyz: v_rotation_wxyz,
+        opacity_logit: v.opacity * opacity * (1.0 - opacity),
+        sh: v_sh,
+    };
+    // A step of the camera moves the point in the camera, and the place from which the color is seen.
+    let v_translation = v_still_point + camera_from_world * v_offset;
+    let v_rotation =
+        parts.still_point.cross(&v_still_point) + by_rotation(&(v_camera_from_world * camera_from_world.transpose()));
+    let by_view = ViewGrad {
+        pose: [v_translation.x, v_translation.y, v_translation.z, v_rotation.x, v_rotation.y, v_rotation.z],
+        linear_m: (-row_share * v_point).into(),
+        angular_rad: (-row_share * by_rotation(&v_moved_from_still)).into(),
+    };
+    (by_splat, by_view)
+}
+
+/// What lies between a splat and its place on the image.
+struct Parts {
+    /// Center in the camera at the middle row.
+    still_point: Vector3<f64>,
+    /// Center in the camera when the splat's row is read.
+    point_in_camera: Vector3<f64>,
+    /// Linear part of the camera's motion between the two.
+    moved_from_still: Matrix3<f64>,
+    /// Linear part from world to the moved camera.
+    moved_from_world: Matrix3<f64>,
+    cov_in_world: Matrix3<f64>,
+    /// Slope ratios x/z and y/z as the Jacobian uses them, and whether each was clamped.
+    ratio: [(f64, bool); 2],
+    /// Of pixels by the point in the camera.
+    jacobian: Matrix2x3<f64>,
+    image_from_world: Matrix2x3<f64>,
+    cov_px2: Matrix2<f64>,
+    conic: Matrix2<f64>,
+}
+
+impl Parts {
+    fn new(view: &View, splat: &Splat, row_share: f64) -> Self {
+        let camera_from_world = view.camera_from_world.rotation.to_rotation_matrix().into_inner();
+        let linear_m = Vector3::from(view.linear_m);
+        let angular_rad = Vector3::from(view.angular_rad);
+
+        let still_point = camera_from_world * Vector3::from(splat.mean) + view.camera_from_world.translation.vector;
+        let point_in_camera = still_point - row_share * (linear_m + angular_rad.cross(&still_point));
+        let moved_from_still = Matrix3::identity() - row_share * angular_rad.cross_matrix();
+        let moved_from_world = moved_from_still * camera_from_world;
+
+        let axes = rotation_matrix(&unit(&splat.rotation_wxyz))
+            * Matrix3::from_diagonal(&Vector3::from(splat.log_scale).map(f64::exp));
+        let cov_in_world = axes * axes.transpose();
+
+        let z = point_in_camera.z;
+        let ratio = [0, 1].map(|axis| clamped_ratio(view, axis, point_in_camera[axis] / z));
+        let [fx, fy] = view.focal_px;
+        let jacobian = Matrix2x3::new(fx / z, 0.0, -fx * ratio[0].0 / z, 0.0, fy / z, -fy * ratio[1].0 / z);
+        let image_from_world = jacobian * moved_from_world;
+        let cov_px2 =
+            image_from_world * cov_in_world * image_from_world.transpose() + Matrix2::from_diagonal_element(BLUR_PX2);
+        let [a, b, c] = [cov_px2[(0, 0)], cov_px2[(0, 1)], cov_px2[(1, 1)]];
+        let conic = Matrix2::new(c, -b, -b, a) / (a * c - b * b);
+        Self {
+            still_point,
+            point_in_camera,
+            moved_from_still,
+            moved_from_world,
+            cov_in_world,
+            ratio,
+            jacobian,
+            image_from_world,
+            cov_px2,
+            conic,
+        }
+    }
+}
+
+/// Slope x/z (axis 0) or y/z (axis 1) kept within the image and a margin, and whether that changed it.
+fn clamped_ratio(view: &View, axis: usize, ratio: f64) -> (f64, bool) {
+    let (focal_px, principal_px, size_px) =
+        (view.focal_px[axis], view.principal_px[axis], f64::from(view.size_px[axis]));
+    let margin = MARGIN_FRAC * 0.5 * size_px / focal_px;
+    let lowest = -(principal_px / focal_px + margin);
+    let highest = (size_px - principal_px) / focal_px + margin;
+    (ratio.clamp(lowest, highest), ratio < lowest || ratio > highest)
+}
+
+/// From the gradient by the center in pixels to that by the point in the camera.
+fn pinhole_backward(view: &View, point: &Vector3<f64>, v_mean_px: &[f64; 2]) -> Vector3<f64> {
+    let per_z = Vector2::new(view.focal_px[0] * v_mean_px[0], view.focal_px[1] * v_mean_px[1]) / point.z;
+    Vector3::new(per_z.x, per_z.y, -(per_z.x * point.x + per_z.y * point.y) / point.z)
+}
+
+/// From the gradient by the pinhole's Jacobian to that by the point in the camera.
+///
+/// Row `axis` of the Jacobian is `f / z` on the diagonal and `-f * ratio / z` in the last column, where `ratio` is
+/// `point / z` inside the clamp and constant outside.
+fn jacobian_backward(view: &View, parts: &Parts, v_jacobian: &Matrix2x3<f64>) -> Vector3<f64> {
+    let z = parts.point_in_camera.z;
+    let mut v_point = Vector3::zeros();
+    for axis in 0..2 {
+        let (ratio, clamped) = parts.ratio[axis];
+        let (v_diagonal, v_last) = (v_jacobian[(axis, axis)], v_jacobian[(axis, 2)]);
+        let f_per_z2 = view.focal_px[axis] / (z * z);
+        v_point.z += f_per_z2 * (ratio * v_last - v_diagonal);
+        if !clamped {
+            v_point[axis] -= f_per_z2 * v_last;
+            v_point.z += f_per_z2 * ratio * v_last;
+        }
+    }
+    v_point
+}
+
+/// From the gradient by the covariance in world to that by log scale and raw quaternion.
+fn shape_backward(splat: &Splat, v_cov: &Matrix3<f64>) -> ([f64; 3], [f64; 4]) {
+    let unit_wxyz = unit(&splat.rotation_wxyz);
+    let rotation = rotation_matrix(&unit_wxyz);
+    let scale = Vector3::from(splat.log_scale).map(f64::exp);
+    let v_axes = 2.0 * v_cov * rotation * Matrix3::from_diagonal(&scale);
+    let v_log_scale = std::array::from_fn(|axis| rotation.column(axis).dot(&v_axes.column(axis)) * scale[axis]);
+    let v_unit = rotation_matrix_backward(&unit_wxyz, &(v_axes * Matrix3::from_diagonal(&scale)));
+    let along: f64 = unit_wxyz.iter().zip(v_unit).map(|(unit, v)| unit * v).sum();
+    let length = length(&splat.rotation_wxyz);
+    (v_log_scale, std::array::from_fn(|ix| (v_unit[ix] - unit_wxyz[ix] * along) / length))
+}
+
+/// Rotation of a unit quaternion.
+fn rotation_matrix(&[w, x, y, z]: &[f64; 4]) -> Matrix3<f64> {
+    Matrix3::new(
+        1.0 - 2.0 * (y * y + z * z),
+        2.0 * (x * y - w * z),
+        2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z),
+        1.0 - 2.0 * (x * x + z * z),
+        2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y),
+        2.0 * (y * z + w * x),
+        1.0 - 2.0 * (x * x + y * y),
+    )
+}
+
+/// Gradient of [`rotation_matrix`] by its four numbers as free variables.
+fn rotation_matrix_backward(&[w, x, y, z]: &[f64; 4], v: &Matrix3<f64>) -> [f64; 4] {
+    let even = |row, column| v[(row, column)] + v[(column, row)];
+    let odd = |row, column| v[(row, column)] - v[(column, row)];
+    [
+        2.0 * (x * odd(2, 1) + y * odd(0, 2) + z * odd(1, 0)),
+        2.0 * (y * even(0, 1) + z * even(0, 2) + w * odd(2, 1)) - 4.0 * x * (v[(1, 1)] + v[(2, 2)]),
+        2.0 * (x * even(0, 1) + z * even(1, 2) + w * odd(0, 2)) - 4.0 * y * (v[(0, 0)] + v[(2, 2)]),
+        2.0 * (x * even(0, 2) + y * even(1, 2) + w * odd(1, 0)) - 4.0 * z * (v[(0, 0)] + v[(1, 1)]),
+    ]
+}
+
+/// Gradient by the vector `a` of a matrix that holds `a`'s cross-product matrix, from the gradient by the matrix.
+fn by_rotation(v: &Matrix3<f64>) -> Vector3<f64> {
+    Vector3::new(v[(2, 1)] - v[(1, 2)], v[(0, 2)] - v[(2, 0)], v[(1, 0)] - v[(0, 1)])
+}
+
+/// From the camera to the splat, in world.
+fn offset_in_world(view: &View, splat: &Splat) -> Vector3<f64> {
+    let world_from_camera = view.camera_from_world.inverse();
+    Vector3::from(splat.mean) - world_from_camera.translation.vector
+}
+
+fn sigmoid(logit: f64) -> f64 {
+    1.0 / (1.0 + (-logit).exp())
+}
+
+fn length(wxyz: &[f64; 4]) -> f64 {
+    wxyz.iter().map(|part| part * part).sum::<f64>().sqrt()
+}
+
+fn unit(wxyz: &[f64; 4]) -> [f64; 4] {
+    wxyz.map(|part| part / length(wxyz))
+}

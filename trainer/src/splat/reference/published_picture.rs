@@ -1,0 +1,68 @@
+//! Agreement with somebody else's picture: four splats rendered by gsplat, published with Brush (Apache-2.0).
+
+use super::{Splat, View, render};
+use crate::mismatches::Mismatches;
+use kinematics::Transform;
+use nalgebra::Vector3;
+use safetensors::SafeTensors;
+use std::path::PathBuf;
+
+/// The picture was computed in f32; its largest differences are a quarter of these. A splat's faint edge that fell the
+/// other way (alpha 1/255) would be a thousand times as large.
+const ABS: f64 = 2e-6;
+const REL: f64 = 1e-5;
+
+#[test]
+fn agrees_with_a_published_picture() {
+    let folder = std::env::var("FIELDRIG_TEST_DATA")
+        .map_or_else(|_| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data")), PathBuf::from);
+    let Ok(bytes) = std::fs::read(folder.join("splats/brush_tiny_case.safetensors")) else {
+        #[expect(clippy::print_stdout, reason = "says which test was skipped")]
+        {
+            println!("skipped: no test data in {}", folder.display());
+        }
+        return;
+    };
+    let tensors = SafeTensors::deserialize(&bytes).expect("a valid file");
+    let floats = |name: &str| -> Vec<f64> {
+        let data = tensors.tensor(name).expect("the tensor is there").data();
+        data.chunks_exact(4).map(|b| f64::from(f32::from_le_bytes([b[0], b[1], b[2], b[3]]))).collect()
+    };
+    let &[height, width, 4] = tensors.tensor("out_img").expect("the picture is there").shape() else {
+        panic!("the picture has four channels");
+    };
+    // The convention of the file: `scales` are logarithms, `opacities` logits, `quats` w first, `coeffs` as in 3DGS with
+    // the constant first; a camera of 90 degrees at (0.123, 0.456, -8) looking along z, principal point in the middle,
+    // color clamped at 0, premultiplied, no background, the fourth channel 1 - transmittance.
+    let focal_px = 0.5 * width as f64;
+    let view = View {
+        camera_from_world: Transform::new(Vector3::new(-0.123, -0.456, 8.0), Vector3::zeros()),
+        focal_px: [focal_px; 2],
+        principal_px: [0.5 * width as f64, 0.5 * height as f64],
+        size_px: [width, height].map(|side| u32::try_from(side).expect("a small picture")),
+        near_m: 0.01,
+        linear_m: [0.0; 3],
+        angular_rad: [0.0; 3],
+    };
+    let (means, scales, quats) = (floats("means"), floats("scales"), floats("quats"));
+    let (opacities, coeffs, picture) = (floats("opacities"), floats("coeffs"), floats("out_img"));
+    let splat = |ix: usize| Splat {
+        mean: std::array::from_fn(|axis| means[3 * ix + axis]),
+        log_scale: std::array::from_fn(|axis| scales[3 * ix + axis]),
+        rotation_wxyz: std::array::from_fn(|part| quats[4 * ix + part]),
+        opacity_logit: opacities[ix],
+        sh: coeffs[48 * ix..48 * (ix + 1)].as_chunks().0.to_vec(),
+    };
+    let splats: Vec<_> = (0..opacities.len()).map(splat).collect();
+
+    let image = render(&view, &splats);
+    let mut wrong = Mismatches::default();
+    for (pixel_ix, expected) in picture.as_chunks::<4>().0.iter().enumerate() {
+        let [r, g, b] = image.rgb[pixel_ix];
+        for (channel, got) in [r, g, b, 1.0 - image.transmittance[pixel_ix]].into_iter().enumerate() {
+            wrong.check(format!("pixel {pixel_ix} channel {channel}"), got, expected[channel], ABS, REL);
+        }
+    }
+    assert!(picture.iter().filter(|value| **value > 0.1).count() > 1000, "the picture shows something");
+    wrong.assert_none();
+}

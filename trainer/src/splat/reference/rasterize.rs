@@ -1,0 +1,192 @@
+//! Compositing placed splats pixel by pixel, front to back, and the gradient of that.
+//!
+//! Source: Kerbl et al. 2023, section 6 and appendix C.
+
+use super::project::{MIN_ALPHA, project, row_share};
+use super::{Projected, ProjectedGrad, RenderedImage, Splat, Upstream, View};
+
+/// No splat hides more than this share of what lies behind it.
+pub const MAX_ALPHA: f64 = 0.999;
+/// A pixel is full before the splat that would let less than this through.
+pub const MIN_TRANSMITTANCE: f64 = 1e-4;
+
+/// What was decided by comparing numbers, kept as integers so that forward and backward agree.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Decisions {
+    /// Share of the readout at which each splat is seen (see [`row_share`]); `None` for splats that are not drawn.
+    pub row_shares: Vec<Option<f64>>,
+    /// Splats by index that are added to each pixel, front to back; pixels row by row.
+    pub contributors: Vec<Vec<usize>>,
+}
+
+/// Decides who is seen, in which order, and who adds to which pixel.
+pub fn decide(view: &View, splats: &[Splat]) -> Decisions {
+    let projected: Vec<_> = splats.iter().map(|splat| project(view, splat)).collect();
+    let front_to_back = front_to_back(&projected);
+    Decisions {
+        row_shares: projected.iter().zip(splats).map(|(seen, splat)| seen.map(|_| row_share(view, splat))).collect(),
+        contributors: view.pixel_centers().map(|center_px| contributors(&front_to_back, &center_px)).collect(),
+    }
+}
+
+/// Composites the splats that were decided on.
+pub fn composite(view: &View, projected: &[Projected], decisions: &Decisions) -> RenderedImage {
+    let mut image = RenderedImage::default();
+    for (center_px, contributors) in view.pixel_centers().zip(&decisions.contributors) {
+        let (mut rgb, mut depth, mut transmittance) = ([0.0; 3], 0.0, 1.0);
+        for splat in contributors.iter().map(|&splat_ix| &projected[splat_ix]) {
+            let alpha = Coverage::new(splat, &center_px).alpha();
+            let weight = alpha * transmittance;
+            rgb.iter_mut().zip(splat.color).for_each(|(sum, color)| *sum += weight * color);
+            depth += weight * splat.depth;
+            transmittance *= 1.0 - alpha;
+        }
+        image.rgb.push(rgb);
+        image.depth.push(depth);
+        image.transmittance.push(transmittance);
+        image.last_contributor.push(contributors.last().copied());
+    }
+    image
+}
+
+/// Gradient of a loss by each placed splat, from its gradient by the image.
+pub fn composite_backward(
+    view: &View,
+    projected: &[Projected],
+    decisions: &Decisions,
+    upstream: &Upstream,
+) -> Vec<ProjectedGrad> {
+    let mut grads = vec![ProjectedGrad::default(); projected.len()];
+    for (pixel_ix, center_px) in view.pixel_centers().enumerate() {
+        let (v_rgb, v_depth) = (upstream.rgb[pixel_ix], upstream.depth[pixel_ix]);
+        let mut in_front = Vec::new(); // Transmittance in front of each contributor.
+        let mut transmittance = 1.0;
+        for &splat_ix in &decisions.contributors[pixel_ix] {
+            in_front.push(transmittance);
+            transmittance *= 1.0 - Coverage::new(&projected[splat_ix], &center_px).alpha();
+        }
+        // What the loss gains from everything behind the splat at hand.
+        let mut behind = upstream.transmittance[pixel_ix] * transmittance;
+        for (&splat_ix, transmittance) in decisions.contributors[pixel_ix].iter().zip(in_front).rev() {
+            let (splat, grad) = (&projected[splat_ix], &mut grads[splat_ix]);
+            let coverage = Coverage::new(splat, &center_px);
+            let weight = coverage.alpha() * transmittance;
+            let per_weight =
+                (0..3).map(|channel| splat.color[channel] * v_rgb[channel]).sum::<f64>() + splat.depth * v_depth;
+            let v_alpha = transmittance * per_weight - behind / (1.0 - coverage.alpha());
+            grad.color.iter_mut().zip(v_rgb).for_each(|(sum, v)| *sum += weight * v);
+            grad.depth += weight * v_depth;
+            coverage.backward(splat, v_alpha, grad);
+            behind += weight * per_weight;
+        }
+    }
+    grads
+}
+
+/// How far each pixel's decisions are from falling the other way, relative to the threshold.
+///
+/// The smallest relative distance of any alpha to [`MIN_ALPHA`] or [`MAX_ALPHA`] and of any transmittance to
+/// [`MIN_TRANSMITTANCE`]. Arithmetic that rounds more coarsely than this may decide otherwise.
+pub fn threshold_margins(view: &View, splats: &[Splat]) -> Vec<f64> {
+    let projected: Vec<_> = splats.iter().map(|splat| project(view, splat)).collect();
+    let front_to_back = front_to_back(&projected);
+    let margin = |center_px| {
+        let (mut margin, mut transmittance) = (f64::INFINITY, 1.0);
+        for (_, splat) in &front_to_back {
+            let coverage = Coverage::new(splat, &center_px);
+            margin = margin
+                .min((coverage.unclamped / MIN_ALPHA - 1.0).abs())
+                .min((coverage.unclamped / MAX_ALPHA - 1.0).abs());
+            if !coverage.drawn() {
+                continue;
+            }
+            transmittance *= 1.0 - coverage.alpha();
+            margin = margin.min((transmittance / MIN_TRANSMITTANCE - 1.0).abs());
+            if transmittance <= MIN_TRANSMITTANCE {
+                break;
+            }
+        }
+        margin
+    };
+    view.pixel_centers().map(margin).collect()
+}
+
+/// Visible splats with their indices, by depth rounded to f32; of equals the lower index first.
+fn front_to_back(projected: &[Option<Projected>]) -> Vec<(usize, Projected)> {
+    let mut visible: Vec<_> =
+        projected.iter().enumerate().filter_map(|(ix, seen)| seen.map(|splat| (ix, splat))).collect();
+    visible.sort_by_key(|(splat_ix, splat)| (depth_bits(splat.depth), *splat_ix));
+    visible
+}
+
+/// Positive floats order as their bits do.
+fn depth_bits(depth: f64) -> u32 {
+    #[expect(clippy::cast_possible_truncation, reason = "the kernels sort by the depth in f32")]
+    let depth = depth as f32;
+    depth.to_bits()
+}
+
+/// The splats, by index, that are added to the pixel at `center_px`.
+fn contributors(front_to_back: &[(usize, Projected)], center_px: &[f64; 2]) -> Vec<usize> {
+    let mut added = Vec::new();
+    let mut transmittance = 1.0;
+    for (splat_ix, splat) in front_to_back {
+        let coverage = Coverage::new(splat, center_px);
+        if !coverage.drawn() {
+            continue;
+        }
+        transmittance *= 1.0 - coverage.alpha();
+        if transmittance <= MIN_TRANSMITTANCE {
+            break;
+        }
+        added.push(*splat_ix);
+    }
+    added
+}
+
+/// How one splat covers one pixel.
+struct Coverage {
+    /// From the pixel's center to the splat's, pixels.
+    offset_px: [f64; 2],
+    /// Half the squared distance in standard deviations.
+    sigma: f64,
+    /// `exp(-sigma)`.
+    falloff: f64,
+    /// Opacity times falloff.
+    unclamped: f64,
+}
+
+impl Coverage {
+    fn new(splat: &Projected, center_px: &[f64; 2]) -> Self {
+        let [dx, dy] = [splat.mean_px[0] - center_px[0], splat.mean_px[1] - center_px[1]];
+        let [a, b, c] = splat.conic;
+        let sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy;
+        let falloff = (-sigma).exp();
+        Self { offset_px: [dx, dy], sigma, falloff, unclamped: splat.opacity * falloff }
+    }
+
+    fn alpha(&self) -> f64 {
+        self.unclamped.min(MAX_ALPHA)
+    }
+
+    /// A conic that is not positive, from rounding, draws nothing.
+    fn drawn(&self) -> bool {
+        self.sigma >= 0.0 && self.alpha() >= MIN_ALPHA
+    }
+
+    /// Adds the gradient by center, conic and opacity; a clamped alpha passes nothing on.
+    fn backward(&self, splat: &Projected, v_alpha: f64, grad: &mut ProjectedGrad) {
+        if self.unclamped > MAX_ALPHA {
+            return;
+        }
+        let [dx, dy] = self.offset_px;
+        let [a, b, c] = splat.conic;
+        let v_sigma = -self.unclamped * v_alpha;
+        grad.opacity += self.falloff * v_alpha;
+        grad.conic[0] += 0.5 * dx * dx * v_sigma;
+        grad.conic[1] += dx * dy * v_sigma;
+        grad.conic[2] += 0.5 * dy * dy * v_sigma;
+        grad.mean_px[0] += (a * dx + b * dy) * v_sigma;
+        grad.mean_px[1] += (b * dx + c * dy) * v_sigma;
+    }
+}

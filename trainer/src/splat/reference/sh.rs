@@ -1,0 +1,151 @@
+//! Color of a splat from the direction it is seen in: real spherical harmonics up to degree 3.
+//!
+//! Source: Kerbl et al. 2023 for constants, order and signs; the polynomials agree with Sloan 2013 on the unit sphere.
+
+use nalgebra::Vector3;
+
+/// Coefficients of the highest degree.
+pub const MAX_N_COEFFS: usize = 16;
+
+const C0: f64 = 0.282_094_791_773_878_14;
+const C1: f64 = 0.488_602_511_902_919_9;
+const C2: [f64; 5] = [
+    1.092_548_430_592_079_2,
+    -1.092_548_430_592_079_2,
+    0.315_391_565_252_520_05,
+    -1.092_548_430_592_079_2,
+    0.546_274_215_296_039_6,
+];
+const C3: [f64; 7] = [
+    -0.590_043_589_926_643_5,
+    2.890_611_442_640_554,
+    -0.457_045_799_464_465_8,
+    0.373_176_332_590_115_4,
+    -0.457_045_799_464_465_8,
+    1.445_305_721_320_277,
+    -0.590_043_589_926_643_5,
+];
+
+/// Color seen along `offset`, the vector from the camera to the splat in world; clamped at 0 from below.
+///
+/// `sh` holds 1, 4, 9 or 16 coefficients.
+pub fn color(sh: &[[f64; 3]], offset: &Vector3<f64>) -> [f64; 3] {
+    unclamped_color(sh, offset).map(|channel| channel.max(0.0))
+}
+
+/// Gradient by `sh` and by `offset`, from the gradient by the color; a clamped channel passes nothing on.
+pub fn color_backward(sh: &[[f64; 3]], offset: &Vector3<f64>, v_color: &[f64; 3]) -> (Vec<[f64; 3]>, Vector3<f64>) {
+    let direction = offset.normalize();
+    let (basis, by_direction) = (basis(&direction), basis_gradient(&direction));
+    let unclamped = unclamped_color(sh, offset);
+    let v_color: [f64; 3] =
+        std::array::from_fn(|channel| if unclamped[channel] > 0.0 { v_color[channel] } else { 0.0 });
+    let mut v_direction = Vector3::zeros();
+    let mut v_sh = Vec::with_capacity(sh.len());
+    for (coeff_ix, coeff) in sh.iter().enumerate() {
+        v_sh.push(v_color.map(|v| v * basis[coeff_ix]));
+        let v_basis: f64 = (0..3).map(|channel| v_color[channel] * coeff[channel]).sum();
+        v_direction += by_direction[coeff_ix] * v_basis;
+    }
+    // The length of the offset does not matter, so the part along the direction goes.
+    let v_offset = (v_direction - direction * direction.dot(&v_direction)) / offset.norm();
+    (v_sh, v_offset)
+}
+
+/// Values of the basis functions at a unit direction.
+pub fn basis(direction: &Vector3<f64>) -> [f64; MAX_N_COEFFS] {
+    let (x, y, z) = (direction.x, direction.y, direction.z);
+    let (xx, yy, zz) = (x * x, y * y, z * z);
+    [
+        C0,
+        -C1 * y,
+        C1 * z,
+        -C1 * x,
+        C2[0] * x * y,
+        C2[1] * y * z,
+        C2[2] * (2.0 * zz - xx - yy),
+        C2[3] * x * z,
+        C2[4] * (xx - yy),
+        C3[0] * y * (3.0 * xx - yy),
+        C3[1] * x * y * z,
+        C3[2] * y * (4.0 * zz - xx - yy),
+        C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+        C3[4] * x * (4.0 * zz - xx - yy),
+        C3[5] * z * (xx - yy),
+        C3[6] * x * (xx - 3.0 * yy),
+    ]
+}
+
+/// Gradients of the basis polynomials by x, y and z as free variables.
+fn basis_gradient(direction: &Vector3<f64>) -> [Vector3<f64>; MAX_N_COEFFS] {
+    let (x, y, z) = (direction.x, direction.y, direction.z);
+    let (xx, yy, zz) = (x * x, y * y, z * z);
+    [
+        Vector3::zeros(),
+        Vector3::new(0.0, -C1, 0.0),
+        Vector3::new(0.0, 0.0, C1),
+        Vector3::new(-C1, 0.0, 0.0),
+        C2[0] * Vector3::new(y, x, 0.0),
+        C2[1] * Vector3::new(0.0, z, y),
+        C2[2] * Vector3::new(-2.0 * x, -2.0 * y, 4.0 * z),
+        C2[3] * Vector3::new(z, 0.0, x),
+        C2[4] * Vector3::new(2.0 * x, -2.0 * y, 0.0),
+        C3[0] * Vector3::new(6.0 * x * y, 3.0 * (xx - yy), 0.0),
+        C3[1] * Vector3::new(y * z, x * z, x * y),
+        C3[2] * Vector3::new(-2.0 * x * y, 4.0 * zz - xx - 3.0 * yy, 8.0 * y * z),
+        C3[3] * Vector3::new(-6.0 * x * z, -6.0 * y * z, 6.0 * zz - 3.0 * xx - 3.0 * yy),
+        C3[4] * Vector3::new(4.0 * zz - 3.0 * xx - yy, -2.0 * x * y, 8.0 * x * z),
+        C3[5] * Vector3::new(2.0 * x * z, -2.0 * y * z, xx - yy),
+        C3[6] * Vector3::new(3.0 * (xx - yy), -6.0 * x * y, 0.0),
+    ]
+}
+
+fn unclamped_color(sh: &[[f64; 3]], offset: &Vector3<f64>) -> [f64; 3] {
+    let basis = basis(&offset.normalize());
+    std::array::from_fn(|channel| 0.5 + sh.iter().zip(basis).map(|(coeff, value)| coeff[channel] * value).sum::<f64>())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mismatches::Mismatches;
+
+    #[test]
+    fn basis_is_orthonormal_on_the_sphere() {
+        const N_AZIMUTHS: u32 = 16; // Enough for products of degree 6: the sum over azimuths is then exact.
+        // Gauss-Legendre with 4 points is exact to degree 7 in z (Abramowitz and Stegun 1964, table 25.4).
+        const HEIGHTS: [(f64, f64); 4] = [
+            (-0.861_136_311_594_052_6, 0.347_854_845_137_453_9),
+            (-0.339_981_043_584_856_3, 0.652_145_154_862_546_1),
+            (0.339_981_043_584_856_3, 0.652_145_154_862_546_1),
+            (0.861_136_311_594_052_6, 0.347_854_845_137_453_9),
+        ];
+        let mut products = [[0.0; MAX_N_COEFFS]; MAX_N_COEFFS];
+        for azimuth_ix in 0..N_AZIMUTHS {
+            let azimuth_rad = std::f64::consts::TAU * f64::from(azimuth_ix) / f64::from(N_AZIMUTHS);
+            for (z, weight) in HEIGHTS {
+                let radius = (1.0 - z * z).sqrt();
+                let values = basis(&Vector3::new(radius * azimuth_rad.cos(), radius * azimuth_rad.sin(), z));
+                let area = weight * std::f64::consts::TAU / f64::from(N_AZIMUTHS);
+                for (row, a) in products.iter_mut().zip(values) {
+                    row.iter_mut().zip(values).for_each(|(product, b)| *product += area * a * b);
+                }
+            }
+        }
+        let mut wrong = Mismatches::default();
+        for (i, row) in products.iter().enumerate() {
+            for (j, &product) in row.iter().enumerate() {
+                wrong.check(format!("<{i}, {j}>"), product, if i == j { 1.0 } else { 0.0 }, 1e-12, 0.0);
+            }
+        }
+        wrong.assert_none();
+    }
+
+    #[test]
+    fn basis_has_the_signs_of_published_splat_files() {
+        // Here every polynomial is positive before its constant (x > sqrt(3) y > 0, z large), so the constants' signs show.
+        let signs = basis(&Vector3::new(0.36, 0.2, 0.9).normalize()).map(f64::signum);
+        let published = [1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1].map(f64::from);
+        assert_eq!(signs, published);
+    }
+}

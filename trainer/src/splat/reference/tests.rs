@@ -1,0 +1,290 @@
+//! Gradients through a whole render, and what a render must keep to whatever the scene.
+
+use super::project::{MIN_ALPHA, project_at, row_share};
+use super::rasterize::{MAX_ALPHA, MIN_TRANSMITTANCE, threshold_margins};
+use super::scene::{Random, rolling_view, small_scene, some_upstream, tilted_view};
+use super::*;
+use crate::mismatches::Mismatches;
+
+const NUDGE: f64 = 1e-5;
+/// Rounding of a loss of a few tens, divided by the nudge.
+const ABS: f64 = 2e-8;
+/// Truncation: the nudge squared times third derivatives, which small sharp splats make large.
+const REL: f64 = 1e-6;
+
+/// Compares every gradient of a render with central differences; decisions are held.
+fn check_gradients(view: &View, splats: &[Splat], wrong: &mut Mismatches) {
+    let upstream = some_upstream(7, view);
+    let decisions = decide(view, splats);
+    let grad = render_backward(view, splats, &upstream);
+    let loss = |view: &View, splats: &[Splat]| upstream.dot(&render_decided(view, splats, &decisions));
+
+    for (splat_ix, splat) in splats.iter().enumerate() {
+        for param in splat.params() {
+            let nudged = |nudge| {
+                let mut splats = splats.to_vec();
+                splats[splat_ix] = splat.nudged(param, nudge);
+                loss(view, &splats)
+            };
+            let numeric = (nudged(NUDGE) - nudged(-NUDGE)) / (2.0 * NUDGE);
+            wrong.check(format!("splat {splat_ix} {param:?}"), grad.splats[splat_ix].get(param), numeric, ABS, REL);
+        }
+    }
+    for ix in 0..6 {
+        let moved = |nudge| loss(&view.moved(&std::array::from_fn(|i| if i == ix { nudge } else { 0.0 })), splats);
+        wrong.check(format!("pose {ix}"), grad.view.pose[ix], (moved(NUDGE) - moved(-NUDGE)) / (2.0 * NUDGE), ABS, REL);
+    }
+    for axis in 0..3 {
+        let moved = |nudge| {
+            let mut view = view.clone();
+            view.linear_m[axis] += nudge;
+            loss(&view, splats)
+        };
+        let turned = |nudge| {
+            let mut view = view.clone();
+            view.angular_rad[axis] += nudge;
+            loss(&view, splats)
+        };
+        wrong.check(
+            format!("linear {axis}"),
+            grad.view.linear_m[axis],
+            (moved(NUDGE) - moved(-NUDGE)) / (2.0 * NUDGE),
+            ABS,
+            REL,
+        );
+        wrong.check(
+            format!("angular {axis}"),
+            grad.view.angular_rad[axis],
+            (turned(NUDGE) - turned(-NUDGE)) / (2.0 * NUDGE),
+            ABS,
+            REL,
+        );
+    }
+}
+
+#[test]
+fn gradients_match_central_differences() {
+    let mut wrong = Mismatches::default();
+    for seed in 1..=3 {
+        check_gradients(&tilted_view(), &small_scene(seed, 12), &mut wrong);
+    }
+    wrong.assert_none();
+}
+
+#[test]
+fn gradients_match_central_differences_with_a_rolling_shutter() {
+    let mut wrong = Mismatches::default();
+    for seed in 4..=5 {
+        check_gradients(&rolling_view(), &small_scene(seed, 12), &mut wrong);
+    }
+    wrong.assert_none();
+}
+
+#[test]
+fn gradients_match_central_differences_where_things_are_clamped() {
+    let view = rolling_view();
+    let splats = clamped_scene(&view);
+    let mut wrong = Mismatches::default();
+    check_gradients(&view, &splats, &mut wrong);
+    wrong.assert_none();
+
+    let grad = render_backward(&view, &splats, &some_upstream(7, &view));
+    assert!(
+        grad.splats[1].sh.iter().all(|coeff| coeff[1] == 0.0 && coeff[0] != 0.0),
+        "a color below 0 passes nothing on"
+    );
+    let center_of_3 = project(&view, &splats[3]).expect("it is seen");
+    let clamped = view.pixel_centers().zip(decide(&view, &splats).contributors).filter(|(center_px, contributors)| {
+        contributors.contains(&3) && center_of_3.opacity * (-sigma(&center_of_3, center_px)).exp() > MAX_ALPHA
+    });
+    assert!(clamped.count() > 0, "no pixel reaches the bound of alpha");
+    assert!(grad.splats[0].mean.iter().all(|v| v.abs() > 1e-6), "the splat beside the image matters to it");
+}
+
+/// A large splat beside the image (its Jacobian is clamped along x and, for another, y), one with a channel far below 0,
+/// one almost opaque (its alpha is clamped at some pixels), two at exactly the same place, and some more.
+fn clamped_scene(view: &View) -> Vec<Splat> {
+    let world_from_camera = view.camera_from_world.inverse();
+    let in_world = |x, y, z| (world_from_camera * nalgebra::Point3::new(x, y, z)).coords.into();
+    let mut splats = small_scene(6, 10);
+    let z = 1.6;
+    splats[0].mean = in_world(0.95 * z, 0.1 * z, z); // The image ends at x/z = 0.47, the clamp at 0.61.
+    splats[0].log_scale = [-0.4, -0.6, -0.5];
+    splats[1].sh[0][1] = -3.0;
+    splats[2].mean = in_world(-0.02 * z, -0.75 * z, z); // The image ends at y/z = -0.37, the clamp at -0.48.
+    splats[2].log_scale = [-0.5, -0.7, -0.6];
+    splats[3].opacity_logit = 20.0;
+    splats[3].log_scale = [0.0; 3]; // So wide that a pixel lies where alpha is above its bound.
+    splats[3].mean = in_world(0.02, 0.03, 2.4); // Behind the others.
+    splats[5].mean = splats[4].mean;
+    splats
+}
+
+/// Half the squared distance of a pixel from a placed splat, in standard deviations.
+fn sigma(placed: &Projected, center_px: &[f64; 2]) -> f64 {
+    let [dx, dy] = [center_px[0] - placed.mean_px[0], center_px[1] - placed.mean_px[1]];
+    0.5 * (placed.conic[0] * dx * dx + placed.conic[2] * dy * dy) + placed.conic[1] * dx * dy
+}
+
+#[test]
+fn a_wrong_gradient_is_noticed() {
+    let (view, splats) = (tilted_view(), small_scene(1, 4));
+    let upstream = some_upstream(7, &view);
+    let grad = render_backward(&view, &splats, &upstream);
+    let decisions = decide(&view, &splats);
+    let mut wrong = Mismatches::default();
+    let params = splats[0].params();
+    for &param in &params {
+        let loss = |nudge| {
+            let mut splats = splats.clone();
+            splats[0] = splats[0].nudged(param, nudge);
+            upstream.dot(&render_decided(&view, &splats, &decisions))
+        };
+        let numeric = (loss(NUDGE) - loss(-NUDGE)) / (2.0 * NUDGE);
+        wrong.check(format!("{param:?} off by 0.01 %"), grad.splats[0].get(param) * 1.0001, numeric, ABS, REL);
+    }
+    assert_eq!(wrong.n_wrong(), params.len());
+}
+
+#[test]
+fn each_parameter_matters_somewhere() {
+    // Else the comparison above would be one of zeros.
+    let view = rolling_view();
+    let grad = render_backward(&view, &small_scene(4, 12), &some_upstream(7, &view));
+    let visible: Vec<_> = grad.splats.iter().filter(|splat| splat.opacity_logit != 0.0).collect();
+    assert!(visible.len() >= 8, "only {} splats are seen", visible.len());
+    for splat in visible {
+        assert!(splat.params().iter().all(|&param| splat.get(param).abs() > 1e-9), "{splat:?}");
+    }
+    let twist = grad.view.linear_m.iter().chain(&grad.view.angular_rad);
+    assert!(grad.view.pose.iter().chain(twist).all(|v| v.abs() > 1e-3), "{:?}", grad.view);
+}
+
+#[test]
+fn a_camera_at_rest_sees_the_same_with_and_without_readout() {
+    let splats = small_scene(2, 8);
+    let still = render(&tilted_view(), &splats);
+    let moving = render(&rolling_view(), &splats);
+    assert_ne!(still.rgb, moving.rgb);
+    // In the middle row a moving camera sees what a camera at rest does.
+    let view = View { angular_rad: [0.0; 3], ..rolling_view() };
+    for splat in &splats {
+        assert_eq!(project_at(&view, splat, 0.0).mean_px, project_at(&tilted_view(), splat, 0.0).mean_px);
+    }
+}
+
+#[test]
+fn rolling_shutter_follows_the_camera_of_each_row() {
+    // The first-order motion of the reference against the exact pose at the splat's own row.
+    let view = View { linear_m: [2e-3, -1e-3, 3e-3], angular_rad: [1e-3, -2e-3, 2e-3], ..tilted_view() };
+    const ABS_PX: f64 = 1e-3; // The second order of the motion: (2e-3)^2 times 31 px, and the row's own shift of 0.1 px.
+    let mut wrong = Mismatches::default();
+    for (ix, splat) in small_scene(2, 8).iter().enumerate() {
+        let share = row_share(&view, splat);
+        let motion: [f64; 6] =
+            std::array::from_fn(|i| -share * view.linear_m.iter().chain(&view.angular_rad).nth(i).expect("6 numbers"));
+        let at_row = View { linear_m: [0.0; 3], angular_rad: [0.0; 3], ..view.moved(&motion) };
+        let (got, expected) = (project_at(&view, splat, share), project_at(&at_row, splat, 0.0));
+        let still = project_at(&tilted_view(), splat, 0.0);
+        assert!((got.mean_px[0] - still.mean_px[0]).abs() > 5.0 * ABS_PX * share.abs(), "splat {ix} hardly moves");
+        for axis in 0..2 {
+            wrong.check(format!("splat {ix} axis {axis}"), got.mean_px[axis], expected.mean_px[axis], ABS_PX, 0.0);
+        }
+        for (got, expected) in got.conic.into_iter().zip(expected.conic) {
+            wrong.check(format!("splat {ix} conic"), got, expected, 1e-6, 1e-4);
+        }
+    }
+    wrong.assert_none();
+}
+
+#[test]
+fn the_extent_holds_all_that_is_drawn_and_no_more() {
+    let view = rolling_view();
+    for splat in small_scene(3, 20) {
+        let placed = project(&view, &splat).expect("all are in front of the camera");
+        let [a, b, c] = placed.conic;
+        // The smallest sigma along each side of the box is that at which alpha is just not drawn.
+        let [half_x, half_y] = placed.extent_px;
+        for (dx, dy) in [(half_x, -b / c * half_x), (-b / a * half_y, half_y)] {
+            let alpha = placed.opacity * (-sigma(&placed, &[placed.mean_px[0] + dx, placed.mean_px[1] + dy])).exp();
+            assert!((alpha / MIN_ALPHA - 1.0).abs() < 1e-12, "{alpha}");
+        }
+    }
+}
+
+#[test]
+fn faint_splats_and_near_ones_are_not_seen() {
+    let view = tilted_view();
+    let mut splat = small_scene(1, 1).remove(0);
+    let logit = |opacity: f64| (opacity / (1.0 - opacity)).ln();
+    splat.opacity_logit = logit(MIN_ALPHA * 0.999);
+    assert_eq!(project(&view, &splat), None);
+    splat.opacity_logit = logit(MIN_ALPHA * 1.001);
+    let depth = project(&view, &splat).expect("just bright enough").depth;
+    assert!(project(&View { near_m: depth * 1.001, ..view.clone() }, &splat).is_none());
+    assert!(project(&View { near_m: depth * 0.999, ..view.clone() }, &splat).is_some());
+    for broken in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+        splat.mean[0] = broken;
+        assert_eq!(project(&view, &splat), None, "a center at {broken}");
+    }
+}
+
+#[test]
+fn full_pixels_stop_and_keep_what_is_left() {
+    let view = tilted_view();
+    let mut random = Random::new(3);
+    // Ten wide, almost opaque splats one behind the other, given back to front.
+    let splats: Vec<_> = (0..10)
+        .map(|ix| {
+            let point_in_camera = nalgebra::Point3::new(0.0, 0.0, 2.0 - 0.1 * f64::from(ix));
+            Splat {
+                mean: (view.camera_from_world.inverse() * point_in_camera).coords.into(),
+                log_scale: [0.5; 3],
+                rotation_wxyz: random.array(-1.0, 1.0),
+                opacity_logit: 2.0,
+                sh: vec![random.array(0.0, 1.0)],
+            }
+        })
+        .collect();
+    let decisions = decide(&view, &splats);
+    let image = render(&view, &splats);
+    let center = 10 * 28 + 13; // The principal point's pixel.
+    assert_eq!(decisions.contributors[center], [9, 8, 7, 6]);
+    assert_eq!(image.last_contributor[center], Some(6));
+    assert!(image.transmittance.iter().all(|&left| left > MIN_TRANSMITTANCE));
+    let left = (1.0 - 0.880_797_f64).powi(4); // sigmoid(2)
+    assert!((image.transmittance[center] / left - 1.0).abs() < 0.05, "{}", image.transmittance[center]);
+}
+
+#[test]
+fn equal_depths_are_drawn_by_index_and_nothing_draws_nothing() {
+    let view = tilted_view();
+    let mut splats = small_scene(4, 2);
+    splats[1].mean = splats[0].mean;
+    let center = decide(&view, &splats).contributors.into_iter().max_by_key(Vec::len).expect("there are pixels");
+    assert_eq!(center, [0, 1]);
+
+    let empty = render(&view, &[]);
+    assert_eq!(empty.rgb, vec![[0.0; 3]; view.n_pixels()]);
+    assert_eq!(empty.transmittance, vec![1.0; view.n_pixels()]);
+    assert_eq!(empty.last_contributor, vec![None; view.n_pixels()]);
+}
+
+#[test]
+fn margins_tell_which_pixels_may_be_decided_otherwise() {
+    let (view, splats) = (tilted_view(), small_scene(1, 12));
+    let margins = threshold_margins(&view, &splats);
+    let before = decide(&view, &splats);
+    // Raising every logit by a tenth changes alphas by up to a tenth: it may change a pixel's contributors only where the margin is as small.
+    let brighter: Vec<_> = splats.iter().map(|splat| splat.nudged(scene::Param::OpacityLogit, 0.1)).collect();
+    let after = decide(&view, &brighter);
+    let changed: Vec<_> =
+        (0..view.n_pixels()).filter(|&ix| before.contributors[ix] != after.contributors[ix]).collect();
+    assert!(!changed.is_empty(), "the nudge is too small to show anything");
+    assert!(
+        changed.iter().all(|&ix| margins[ix] < 0.11),
+        "{:?}",
+        changed.iter().map(|&ix| margins[ix]).collect::<Vec<_>>()
+    );
+    assert!(margins.iter().filter(|&&margin| margin > 0.11).count() > view.n_pixels() / 2);
+}
