@@ -24,9 +24,13 @@ pub fn project(view: &View, splat: &Splat) -> Option<Projected> {
 
 /// When the splat's row is read, as a share of the readout: -0.5 for the first row, 0.5 for the last.
 ///
-/// The row is that of the camera's pose at the middle row, without motion.
+/// The row is that of the camera's pose at the middle row, without motion; a splat not in front of that camera has none
+/// and is taken to be read with the middle row.
 pub fn row_share(view: &View, splat: &Splat) -> f64 {
     let point_in_camera = view.camera_from_world * nalgebra::Point3::from(splat.mean);
+    if point_in_camera.z < view.near_m {
+        return 0.0;
+    }
     let row_px = view.focal_px[1] * point_in_camera.y / point_in_camera.z + view.principal_px[1];
     (row_px / f64::from(view.size_px[1])).clamp(0.0, 1.0) - 0.5
 }

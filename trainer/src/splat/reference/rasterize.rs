@@ -83,32 +83,37 @@ pub fn composite_backward(
     grads
 }
 
-/// How far each pixel's decisions are from falling the other way, relative to the threshold.
+/// How far each pixel's decisions are from falling the other way, relative to what is compared.
 ///
-/// The smallest relative distance of any alpha to [`MIN_ALPHA`] or [`MAX_ALPHA`] and of any transmittance to
-/// [`MIN_TRANSMITTANCE`]. Arithmetic that rounds more coarsely than this may decide otherwise.
+/// The smallest relative distance of any alpha to [`MIN_ALPHA`] or [`MAX_ALPHA`], of any transmittance to
+/// [`MIN_TRANSMITTANCE`], and between the depths of neighbours in the order unless they are equal. Arithmetic that rounds
+/// more coarsely than this may decide otherwise.
 pub fn threshold_margins(view: &View, splats: &[Splat]) -> Vec<f64> {
     let projected: Vec<_> = splats.iter().map(|splat| project(view, splat)).collect();
     let front_to_back = front_to_back(&projected);
-    let margin = |center_px| {
-        let (mut margin, mut transmittance) = (f64::INFINITY, 1.0);
-        for (_, splat) in &front_to_back {
-            let coverage = Coverage::new(splat, &center_px);
-            margin = margin
-                .min((coverage.unclamped / MIN_ALPHA - 1.0).abs())
-                .min((coverage.unclamped / MAX_ALPHA - 1.0).abs());
-            if !coverage.drawn() {
-                continue;
-            }
-            transmittance *= 1.0 - coverage.alpha();
-            margin = margin.min((transmittance / MIN_TRANSMITTANCE - 1.0).abs());
-            if transmittance <= MIN_TRANSMITTANCE {
-                break;
-            }
+    view.pixel_centers().map(|center_px| threshold_margin(&front_to_back, &center_px)).collect()
+}
+
+fn threshold_margin(front_to_back: &[(usize, Projected)], center_px: &[f64; 2]) -> f64 {
+    let distance = |value: f64, threshold: f64| (value / threshold - 1.0).abs();
+    let (mut margin, mut transmittance, mut depth_in_front) = (f64::INFINITY, 1.0, None);
+    for (_, splat) in front_to_back {
+        let coverage = Coverage::new(splat, center_px);
+        margin = margin.min(distance(coverage.unclamped, MIN_ALPHA)).min(distance(coverage.unclamped, MAX_ALPHA));
+        if !coverage.drawn() {
+            continue;
         }
-        margin
-    };
-    view.pixel_centers().map(margin).collect()
+        if let Some(depth_in_front) = depth_in_front.filter(|&depth| depth != splat.depth) {
+            margin = margin.min(distance(splat.depth, depth_in_front));
+        }
+        depth_in_front = Some(splat.depth);
+        transmittance *= 1.0 - coverage.alpha();
+        margin = margin.min(distance(transmittance, MIN_TRANSMITTANCE));
+        if transmittance <= MIN_TRANSMITTANCE {
+            break;
+        }
+    }
+    margin
 }
 
 /// Visible splats with their indices, by depth rounded to f32; of equals the lower index first.

@@ -15,7 +15,7 @@ impl Random {
         Self(seed)
     }
 
-    /// Uniform in `low..high`.
+    /// Uniform in `low..high`, and a number that f32 holds exactly, so that a kernel and its twin start from the same.
     pub(crate) fn uniform(&mut self, low: f64, high: f64) -> f64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut bits = self.0;
@@ -24,7 +24,9 @@ impl Random {
         bits ^= bits >> 31;
         // The upper 32 bits are enough, and exact in f64.
         let share = f64::from(u32::try_from(bits >> 32).expect("32 bits are left")) / f64::from(u32::MAX);
-        low + (high - low) * share
+        #[expect(clippy::cast_possible_truncation, reason = "rounding to f32 is what is wanted")]
+        let rounded = (low + (high - low) * share) as f32;
+        f64::from(rounded)
     }
 
     pub(crate) fn array<const N: usize>(&mut self, low: f64, high: f64) -> [f64; N] {
