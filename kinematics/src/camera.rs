@@ -1,5 +1,9 @@
 //! Camera models: pixel `(0, 0)` covers `[0,1) x [0,1)`; x right, y down, z forward.
 
+use crate::Error;
+use crate::lens;
+use nalgebra::{Matrix2x3, Vector2, Vector3};
+
 /// Lens parameters of one camera at one image size.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Intrinsics {
@@ -24,4 +28,309 @@ pub enum Lens {
     BrownConrady([f64; 5]),
     /// Fisheye, equidistant polynomial k1 k2 k3 k4 (Kannala and Brandt 2006, as in OpenCV's fisheye model).
     KannalaBrandt([f64; 4]),
+}
+
+impl Intrinsics {
+    /// Pixel where a point in camera coordinates is seen, inside the image or not.
+    ///
+    /// None where the lens has no picture of it: behind the camera or beside it (`z <= 0`), beyond the radius where the
+    /// distortion polynomial turns back, or not finite.
+    pub fn project(&self, point_in_camera: &Vector3<f64>) -> Option<[f64; 2]> {
+        if point_in_camera.z.is_nan() || point_in_camera.z <= 0.0 {
+            return None;
+        }
+        let plane = point_in_camera.xy() / point_in_camera.z;
+        let distorted = match self.lens_in_use() {
+            Lens::Pinhole => plane,
+            Lens::BrownConrady(k) => lens::brown_conrady(&k, plane)?.value,
+            Lens::KannalaBrandt(k) => lens::kannala_brandt(&k, plane)?.value,
+        };
+        self.pixel_at(distorted)
+    }
+
+    /// Like [`Intrinsics::project`], with the derivative of the pixel by the point, pixels per metre.
+    pub fn project_with_jacobian(&self, point_in_camera: &Vector3<f64>) -> Option<([f64; 2], Matrix2x3<f64>)> {
+        let &[x, y, z] = point_in_camera.as_ref();
+        if z.is_nan() || z <= 0.0 {
+            return None;
+        }
+        let plane = Vector2::new(x / z, y / z);
+        let distorted = match self.lens_in_use() {
+            Lens::Pinhole => lens::Distorted::none(plane),
+            Lens::BrownConrady(k) => lens::brown_conrady(&k, plane)?,
+            Lens::KannalaBrandt(k) => lens::kannala_brandt(&k, plane)?,
+        };
+        let plane_by_point = Matrix2x3::new(1.0, 0.0, -plane.x, 0.0, 1.0, -plane.y) / z;
+        let mut pixel_by_point = distorted.jacobian * plane_by_point;
+        pixel_by_point.row_mut(0).scale_mut(self.focal_px[0]);
+        pixel_by_point.row_mut(1).scale_mut(self.focal_px[1]);
+        Some((self.pixel_at(distorted.value)?, pixel_by_point))
+    }
+
+    /// The point with `z = 1` seen at a pixel; its direction is the pixel's ray. Undoes [`Intrinsics::project`] to 1e-12.
+    ///
+    /// None where the lens shows nothing in front of the camera there, or the pixel is not finite.
+    pub fn unproject(&self, pixel: [f64; 2]) -> Option<Vector3<f64>> {
+        let distorted = Vector2::new(
+            (pixel[0] - self.principal_px[0]) / self.focal_px[0],
+            (pixel[1] - self.principal_px[1]) / self.focal_px[1],
+        );
+        if !distorted.iter().all(|value| value.is_finite()) {
+            return None;
+        }
+        let plane = match self.lens_in_use() {
+            Lens::Pinhole => distorted,
+            Lens::BrownConrady(k) => lens::undo_brown_conrady(&k, distorted)?,
+            Lens::KannalaBrandt(k) => lens::undo_kannala_brandt(&k, distorted)?,
+        };
+        Some(Vector3::new(plane.x, plane.y, 1.0))
+    }
+
+    /// The same camera with its image resized to `frac` of the size, rounded to whole pixels and at least one.
+    ///
+    /// Focal length and principal point follow the rounded size, so a corner of the image stays a corner.
+    #[expect(clippy::cast_possible_truncation, reason = "the cast saturates, which is meant")]
+    pub fn scaled(&self, frac: f64) -> Self {
+        let size_px = self.size_px.map(|size| ((f64::from(size) * frac).round() as u32).max(1));
+        self.resized(size_px)
+    }
+
+    /// The same camera with its image resized to `size_px`.
+    pub fn resized(&self, size_px: [u32; 2]) -> Self {
+        let ratio = |axis: usize| f64::from(size_px[axis]) / f64::from(self.size_px[axis]);
+        Self {
+            size_px,
+            focal_px: [self.focal_px[0] * ratio(0), self.focal_px[1] * ratio(1)],
+            principal_px: [self.principal_px[0] * ratio(0), self.principal_px[1] * ratio(1)],
+            ..*self
+        }
+    }
+
+    /// The pinhole camera of the same size, focal length and principal point: what [`crate::Undistortion`] makes of the image.
+    pub fn undistorted(&self) -> Self {
+        Self { lens: Lens::Pinhole, rectified: true, ..*self }
+    }
+
+    /// Whether a pinhole describes the image as it is: rectified, no lens model, or all coefficients of the lens zero.
+    pub fn is_pinhole(&self) -> bool {
+        match self.lens_in_use() {
+            Lens::Pinhole => true,
+            Lens::BrownConrady(k) => k == [0.0; 5],
+            Lens::KannalaBrandt(_) => false, // Without coefficients it is still equidistant.
+        }
+    }
+
+    /// Whether a pixel position lies in the image.
+    pub fn contains(&self, pixel: [f64; 2]) -> bool {
+        (0..2).all(|axis| pixel[axis] >= 0.0 && pixel[axis] < f64::from(self.size_px[axis]))
+    }
+
+    /// Refuses sizes of zero, focal lengths that are not positive, and anything not finite.
+    pub fn validate(&self) -> Result<(), Error> {
+        let check = |what, value: f64, fine: bool, allowed| match fine {
+            true => Ok(()),
+            false => Err(Error::Intrinsics { what, value, allowed }),
+        };
+        const NAMES: [[&str; 3]; 2] =
+            [["width", "focal length x", "principal point x"], ["height", "focal length y", "principal point y"]];
+        for (axis, [size_name, focal_name, principal_name]) in NAMES.into_iter().enumerate() {
+            let (size, focal, principal) = (self.size_px[axis], self.focal_px[axis], self.principal_px[axis]);
+            check(size_name, f64::from(size), size > 0, "at least 1 px")?;
+            check(focal_name, focal, focal.is_finite() && focal > 0.0, "a positive number of pixels")?;
+            check(principal_name, principal, principal.is_finite(), "a finite number of pixels")?;
+        }
+        let coefficients: &[f64] = match &self.lens {
+            Lens::Pinhole => &[],
+            Lens::BrownConrady(k) => k,
+            Lens::KannalaBrandt(k) => k,
+        };
+        coefficients.iter().try_for_each(|&k| check("a distortion coefficient", k, k.is_finite(), "a finite number"))
+    }
+
+    fn lens_in_use(&self) -> Lens {
+        if self.rectified { Lens::Pinhole } else { self.lens }
+    }
+
+    fn pixel_at(&self, distorted: Vector2<f64>) -> Option<[f64; 2]> {
+        let pixel = [0, 1].map(|axis| self.focal_px[axis] * distorted[axis] + self.principal_px[axis]);
+        (pixel[0].is_finite() && pixel[1].is_finite()).then_some(pixel)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ROUND_TRIP: f64 = 1e-12; // On the plane z = 1.
+
+    fn camera(lens: Lens) -> Intrinsics {
+        Intrinsics {
+            size_px: [640, 480],
+            focal_px: [600.0, 580.0],
+            principal_px: [321.5, 238.25],
+            lens,
+            rectified: false,
+        }
+    }
+
+    fn lenses() -> Vec<Lens> {
+        vec![
+            Lens::Pinhole,
+            Lens::BrownConrady([0.0578421, -0.0805099, -0.000980296, 0.00015575, 0.0]),
+            Lens::BrownConrady([-0.28, 0.07, 0.001, -0.0005, 0.02]),
+            Lens::BrownConrady([0.12, -0.31, 0.002, 0.001, 0.19]),
+            Lens::KannalaBrandt([0.0; 4]),
+            Lens::KannalaBrandt([-0.01, 0.02, -0.015, 0.003]),
+        ]
+    }
+
+    fn pixels() -> impl Iterator<Item = [f64; 2]> {
+        (0..=16).flat_map(|row| (0..=16).map(move |column| [f64::from(column) * 40.0, f64::from(row) * 30.0]))
+    }
+
+    #[test]
+    fn every_pixel_of_every_lens_comes_back() {
+        for lens in lenses() {
+            let camera = camera(lens);
+            for pixel in pixels() {
+                let ray = camera.unproject(pixel).unwrap_or_else(|| panic!("{lens:?} shows nothing at {pixel:?}"));
+                assert_eq!(ray.z, 1.0);
+                for depth_m in [0.01, 1.0, 30.0] {
+                    let back = camera.project(&(ray * depth_m)).unwrap();
+                    for axis in 0..2 {
+                        let off = (back[axis] - pixel[axis]).abs() / camera.focal_px[axis];
+                        assert!(off < ROUND_TRIP, "{lens:?} {pixel:?} off by {off}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn brown_conrady_follows_the_formula_by_hand() {
+        // x = 0.5, y = 0.25: r2 = 0.3125, r4 = 0.09765625, r6 = 0.030517578125.
+        let camera = camera(Lens::BrownConrady([0.1, 0.2, 0.01, 0.02, 0.4]));
+        let radial = 1.0 + 0.03125 + 0.01953125 + 0.01220703125;
+        let x = 0.5 * radial + 2.0 * 0.01 * 0.125 + 0.02 * (0.3125 + 0.5);
+        let y = 0.25 * radial + 0.01 * (0.3125 + 0.125) + 2.0 * 0.02 * 0.125;
+        let [u, v] = camera.project(&Vector3::new(1.0, 0.5, 2.0)).unwrap();
+        assert!((u - (600.0 * x + 321.5)).abs() < 1e-10);
+        assert!((v - (580.0 * y + 238.25)).abs() < 1e-10);
+    }
+
+    #[test]
+    fn equidistant_fisheye_measures_the_angle() {
+        let camera = camera(Lens::KannalaBrandt([0.0; 4]));
+        let angle = 0.9_f64;
+        let [u, v] = camera.project(&Vector3::new(3.0 * angle.sin(), 0.0, 3.0 * angle.cos())).unwrap();
+        assert!((u - (600.0 * angle + 321.5)).abs() < 1e-10);
+        assert!((v - 238.25).abs() < 1e-10);
+        let bent = Intrinsics { lens: Lens::KannalaBrandt([0.1, 0.0, 0.0, 0.01]), ..camera };
+        let [_, v] = bent.project(&Vector3::new(0.0, angle.sin(), angle.cos())).unwrap();
+        let by_hand = angle * (1.0 + 0.1 * 0.81 + 0.01 * 0.43046721);
+        assert!((v - (580.0 * by_hand + 238.25)).abs() < 1e-10);
+    }
+
+    #[test]
+    fn derivatives_match_central_differences() {
+        const NUDGE_M: f64 = 1e-6;
+        const CLOSE: f64 = 1e-6; // Pixels per metre out of hundreds: truncation 1e-12 and rounding 1e-13 / 1e-6 of them.
+        for lens in lenses() {
+            let camera = camera(lens);
+            for point in [[0.3, -0.2, 1.5], [0.0, 0.0, 0.7], [-0.4, 0.35, 1.1], [1e-9, 0.0, 1.0]] {
+                let point = Vector3::from(point);
+                let (pixel, jacobian) = camera.project_with_jacobian(&point).unwrap();
+                assert_eq!(Some(pixel), camera.project(&point));
+                for axis in 0..3 {
+                    let mut nudge = Vector3::zeros();
+                    nudge[axis] = NUDGE_M;
+                    let ahead = camera.project(&(point + nudge)).unwrap();
+                    let behind = camera.project(&(point - nudge)).unwrap();
+                    for row in 0..2 {
+                        let numeric = (ahead[row] - behind[row]) / (2.0 * NUDGE_M);
+                        let off = (jacobian[(row, axis)] - numeric).abs();
+                        assert!(off < CLOSE, "{lens:?} {point:?} row {row} axis {axis} off by {off}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_seen_has_no_pixel() {
+        for lens in lenses() {
+            let camera = camera(lens);
+            for point in [[0.0, 0.0, 0.0], [0.1, 0.0, -1.0], [1.0, 1.0, f64::NAN], [f64::NAN, 0.0, 1.0]] {
+                assert_eq!(camera.project(&Vector3::from(point)), None, "{lens:?} {point:?}");
+                assert!(camera.project_with_jacobian(&Vector3::from(point)).is_none(), "{lens:?} {point:?}");
+            }
+            assert_eq!(camera.unproject([f64::NAN, 0.0]), None);
+            assert_eq!(camera.unproject([f64::INFINITY, 0.0]), None);
+        }
+    }
+
+    #[test]
+    fn a_barrel_lens_does_not_fold_the_far_side_back_into_the_image() {
+        // r (1 - 0.3 r2) turns back at r = 1 / sqrt(0.9), where it is 2 / 3 of that.
+        let camera = camera(Lens::BrownConrady([-0.3, 0.0, 0.0, 0.0, 0.0]));
+        let turn = 1.0 / 0.9_f64.sqrt();
+        let at = |radius: f64| camera.project(&Vector3::new(radius * 0.6, radius * 0.8, 1.0));
+        assert!(at(turn * 0.999).is_some());
+        assert_eq!(at(turn * 1.001), None);
+        assert_eq!(at(1.8), None); // The formula alone would put it at 0.03 of the focal length.
+        let seen = |radius: f64| camera.unproject([321.5 + 600.0 * radius * 0.6, 238.25 + 580.0 * radius * 0.8]);
+        assert!(seen(turn * 2.0 / 3.0 * 0.999).is_some());
+        assert_eq!(seen(turn * 2.0 / 3.0 * 1.001), None);
+    }
+
+    #[test]
+    fn a_fisheye_shows_nothing_behind_the_camera() {
+        let camera = camera(Lens::KannalaBrandt([0.0; 4]));
+        assert!(camera.unproject([321.5 + 600.0 * 1.57, 238.25]).is_some());
+        assert_eq!(camera.unproject([321.5 + 600.0 * 1.58, 238.25]), None);
+    }
+
+    #[test]
+    fn rectified_images_ignore_the_lens() {
+        let point = Vector3::new(0.4, -0.3, 1.2);
+        let plain = camera(Lens::Pinhole);
+        for lens in lenses().into_iter().skip(1) {
+            let rectified = Intrinsics { rectified: true, ..camera(lens) };
+            assert_ne!(camera(lens).project(&point), plain.project(&point));
+            assert_eq!(rectified.project(&point), plain.project(&point));
+            assert_eq!(camera(lens).undistorted().project(&point), plain.project(&point));
+            assert!(rectified.is_pinhole() && !camera(lens).is_pinhole());
+        }
+    }
+
+    #[test]
+    fn scaling_keeps_corners_and_the_view() {
+        let half = camera(lenses()[1]).scaled(0.5);
+        assert_eq!((half.size_px, half.focal_px), ([320, 240], [300.0, 290.0]));
+        let odd = camera(lenses()[1]).scaled(0.3333);
+        assert_eq!(odd.size_px, [213, 160]);
+        let point = Vector3::new(0.2, 0.1, 1.0);
+        let [u, v] = camera(lenses()[1]).project(&point).unwrap();
+        let [small_u, small_v] = odd.project(&point).unwrap();
+        assert!((small_u / 213.0 - u / 640.0).abs() < 1e-12 && (small_v / 160.0 - v / 480.0).abs() < 1e-12);
+        assert_eq!(camera(Lens::Pinhole).scaled(0.0).size_px, [1, 1]);
+    }
+
+    #[test]
+    fn nonsense_is_refused() {
+        let good = camera(lenses()[1]);
+        good.validate().unwrap();
+        for bad in [
+            Intrinsics { size_px: [0, 480], ..good.clone() },
+            Intrinsics { focal_px: [600.0, -1.0], ..good.clone() },
+            Intrinsics { focal_px: [f64::NAN, 1.0], ..good.clone() },
+            Intrinsics { principal_px: [0.0, f64::INFINITY], ..good.clone() },
+            Intrinsics { lens: Lens::KannalaBrandt([0.0, f64::NAN, 0.0, 0.0]), ..good },
+        ] {
+            assert!(bad.validate().is_err(), "{bad:?}");
+        }
+        let message = camera(Lens::Pinhole);
+        let message = Intrinsics { size_px: [640, 0], ..message }.validate().unwrap_err().to_string();
+        assert_eq!(message, "camera intrinsics: height is 0, must be at least 1 px");
+    }
 }

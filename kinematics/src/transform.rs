@@ -1,6 +1,7 @@
 //! Rigid motions and velocities.
 
-use nalgebra::{Isometry3, Vector3};
+use crate::Error;
+use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 
 /// Rigid motion; `a_from_b` maps coordinates in frame b to coordinates in frame a, in metres.
 pub type Transform = Isometry3<f64>;
@@ -14,4 +15,222 @@ pub struct Twist {
     pub linear_m_s: Vector3<f64>,
     /// Angular velocity, radians per second.
     pub angular_rad_s: Vector3<f64>,
+}
+
+/// Largest element of `|RᵀR - 1|` taken for rounding in a file: three decimals of a quaternion stay below, a scale of 0.1 % does not.
+pub const RIGID_TOLERANCE: f64 = 1e-3;
+
+/// Below this angle, in radians, the series replace the quotients of [`exp`] and [`log`]: both agree to 1e-16 there.
+const SMALL_ANGLE_RAD: f64 = 1e-4;
+
+/// Reads a 4x4 matrix, row major.
+///
+/// Rounding in the rotation is removed (nearest rotation in the least-squares sense). Refused: anything not finite, a last
+/// row other than `0 0 0 1`, and a rotation part off by more than [`RIGID_TOLERANCE`] or mirrored.
+pub fn from_rows(rows: &[f64; 16]) -> Result<Transform, Error> {
+    if let Some(at) = rows.iter().position(|value| !value.is_finite()) {
+        return Err(Error::TransformNotFinite { row: at / 4, column: at % 4, value: rows[at] });
+    }
+    let last = [rows[12], rows[13], rows[14], rows[15]];
+    if last.iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(got, wanted)| (got - wanted).abs() > RIGID_TOLERANCE) {
+        return Err(Error::LastRow { row: last });
+    }
+    let given = Matrix3::from_fn(|row, column| rows[4 * row + column]);
+    let off = (given.transpose() * given - Matrix3::identity()).abs().max();
+    let determinant = given.determinant();
+    if off > RIGID_TOLERANCE || determinant < 0.0 {
+        return Err(Error::NotRigid { off, allowed: RIGID_TOLERANCE, determinant });
+    }
+    let translation = Translation3::new(rows[3], rows[7], rows[11]);
+    Ok(Transform::from_parts(translation, UnitQuaternion::from_rotation_matrix(&nearest_rotation(given))))
+}
+
+/// Polar factor by Newton's iteration (Higham 1986), which converges quadratically from a matrix this close to a rotation.
+fn nearest_rotation(mut matrix: Matrix3<f64>) -> Rotation3<f64> {
+    const STEPS: usize = 4; // 1e-3 squares to 1e-6, 1e-12, below rounding; one more costs nothing.
+    for _ in 0..STEPS {
+        let inverse_transpose = matrix.try_inverse().expect("a matrix near a rotation has an inverse").transpose();
+        matrix = (matrix + inverse_transpose) * 0.5;
+    }
+    Rotation3::from_matrix_unchecked(matrix)
+}
+
+/// The 4x4 matrix, row major.
+pub fn to_rows(transform: &Transform) -> [f64; 16] {
+    let matrix = transform.to_homogeneous();
+    std::array::from_fn(|at| matrix[(at / 4, at % 4)])
+}
+
+/// Pose between `a` (`frac` 0) and `b` (`frac` 1): translation on a line, rotation at a constant rate the shorter way round.
+pub fn interpolate(a: &Transform, b: &Transform, frac: f64) -> Transform {
+    let translation = a.translation.vector.lerp(&b.translation.vector, frac);
+    // The scaled axis of a unit quaternion has an angle of at most pi, so this is the shorter way.
+    let turn = (a.rotation.inverse() * b.rotation).scaled_axis();
+    Transform::from_parts(translation.into(), a.rotation * UnitQuaternion::from_scaled_axis(turn * frac))
+}
+
+/// Motion of a frame that keeps `twist` for `secs`: `world_from_frame` afterwards is the one before times this.
+///
+/// Source: Murray, Li and Sastry 1994, section 2.3.2 (exponential of se(3)).
+pub fn exp(twist: &Twist, secs: f64) -> Transform {
+    let turn = twist.angular_rad_s * secs;
+    let shift = twist.linear_m_s * secs;
+    let angle = turn.norm();
+    // (1 - cos a) / a² and (a - sin a) / a³.
+    let (first, second) = if angle < SMALL_ANGLE_RAD {
+        (0.5 - angle * angle / 24.0, 1.0 / 6.0 - angle * angle / 120.0)
+    } else {
+        let half = (0.5 * angle).sin() / angle;
+        (2.0 * half * half, (angle - angle.sin()) / angle.powi(3))
+    };
+    let once = turn.cross(&shift);
+    let translation = shift + once * first + turn.cross(&once) * second;
+    Transform::from_parts(translation.into(), UnitQuaternion::from_scaled_axis(turn))
+}
+
+/// The constant twist that makes the motion `transform` in `secs`; the inverse of [`exp`] for turns below half a circle.
+pub fn log(transform: &Transform, secs: f64) -> Twist {
+    let turn = transform.rotation.scaled_axis();
+    let angle = turn.norm();
+    // (1 - (a / 2) cot(a / 2)) / a².
+    let second = if angle < SMALL_ANGLE_RAD {
+        1.0 / 12.0 + angle * angle / 720.0
+    } else {
+        (1.0 - 0.5 * angle / (0.5 * angle).tan()) / (angle * angle)
+    };
+    let translation = transform.translation.vector;
+    let once = turn.cross(&translation);
+    let shift = translation - once * 0.5 + turn.cross(&once) * second;
+    Twist { linear_m_s: shift / secs, angular_rad_s: turn / secs }
+}
+
+impl Twist {
+    /// A frame at rest.
+    pub fn zero() -> Self {
+        Self { linear_m_s: Vector3::zeros(), angular_rad_s: Vector3::zeros() }
+    }
+
+    /// Twist of another frame rigidly attached to this one, in the other's own axes (the adjoint change of frame).
+    pub fn of_attached(&self, this_from_other: &Transform) -> Self {
+        let other_from_this = this_from_other.rotation.inverse();
+        let linear_m_s = self.linear_m_s + self.angular_rad_s.cross(&this_from_other.translation.vector);
+        Self { linear_m_s: other_from_this * linear_m_s, angular_rad_s: other_from_this * self.angular_rad_s }
+    }
+
+    /// How a point at rest in the world moves in this frame, metres per second.
+    pub fn apparent_velocity(&self, point_in_frame: &Vector3<f64>) -> Vector3<f64> {
+        -(self.linear_m_s + self.angular_rad_s.cross(point_in_frame))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::f64::consts::PI;
+
+    const CLOSE: f64 = 1e-12; // Rounding of a few products of numbers near 1.
+
+    fn pose(x: f64, turn: [f64; 3]) -> Transform {
+        Transform::new(Vector3::new(x, -0.4, 1.3), turn.into())
+    }
+
+    fn distance(a: &Transform, b: &Transform) -> f64 {
+        (a.to_homogeneous() - b.to_homogeneous()).abs().max()
+    }
+
+    #[test]
+    fn rows_come_back_and_are_row_major() {
+        let a = pose(0.7, [0.3, -1.2, 2.0]);
+        let rows = to_rows(&a);
+        assert_eq!(rows[3], 0.7);
+        assert_eq!(&rows[12..], &[0.0, 0.0, 0.0, 1.0]);
+        assert!(distance(&from_rows(&rows).unwrap(), &a) < CLOSE);
+        let other = pose(0.7, [0.3, -1.2, 2.0 + 1e-6]);
+        assert!(distance(&from_rows(&rows).unwrap(), &other) > CLOSE);
+    }
+
+    #[test]
+    fn rounded_rotations_become_rotations() {
+        let rows = to_rows(&pose(0.7, [0.3, -1.2, 2.0])).map(|value| (value * 1e4).round() / 1e4);
+        let read = from_rows(&rows).unwrap();
+        let matrix = read.rotation.to_rotation_matrix().into_inner();
+        assert!((matrix.transpose() * matrix - Matrix3::identity()).abs().max() < 1e-15);
+        assert!(distance(&read, &pose(0.7, [0.3, -1.2, 2.0])) < 1e-4);
+    }
+
+    #[test]
+    fn what_is_not_rigid_is_refused() {
+        let rows = to_rows(&pose(0.7, [0.3, -1.2, 2.0]));
+        let with = |at: usize, value: f64| {
+            let mut changed = rows;
+            changed[at] = value;
+            from_rows(&changed)
+        };
+        assert!(matches!(with(6, f64::NAN), Err(Error::TransformNotFinite { row: 1, column: 2, .. })));
+        assert!(matches!(with(3, f64::INFINITY), Err(Error::TransformNotFinite { row: 0, column: 3, .. })));
+        assert!(matches!(with(12, 0.1), Err(Error::LastRow { .. })));
+        assert!(matches!(with(15, 0.0), Err(Error::LastRow { .. })));
+        let mut scaled = rows;
+        let mut mirrored = rows;
+        for row in 0..3 {
+            for column in 0..3 {
+                scaled[4 * row + column] *= 1.001;
+            }
+            mirrored[4 * row] *= -1.0;
+        }
+        assert!(matches!(from_rows(&scaled), Err(Error::NotRigid { .. })));
+        assert!(matches!(from_rows(&mirrored), Err(Error::NotRigid { .. })));
+        assert!(matches!(from_rows(&[0.0; 16]), Err(Error::LastRow { .. })));
+    }
+
+    #[test]
+    fn interpolation_meets_both_ends_and_goes_the_shorter_way() {
+        let a = pose(0.0, [0.0, 0.0, 0.0]);
+        let b = pose(1.0, [0.0, 0.0, 1.0]);
+        assert!(distance(&interpolate(&a, &b, 0.0), &a) < CLOSE);
+        assert!(distance(&interpolate(&a, &b, 1.0), &b) < CLOSE);
+        assert!(distance(&interpolate(&a, &b, 0.25), &pose(0.25, [0.0, 0.0, 0.25])) < CLOSE);
+        // 170 degrees to 190 degrees is 20 degrees, and the sign of a quaternion means nothing.
+        let c = pose(0.0, [0.0, 0.0, 170.0 / 180.0 * PI]);
+        let d = pose(0.0, [0.0, 0.0, 190.0 / 180.0 * PI]);
+        let flipped = Transform::from_parts(d.translation, UnitQuaternion::new_unchecked(-d.rotation.into_inner()));
+        for end in [d, flipped] {
+            assert!(distance(&interpolate(&c, &end, 0.5), &pose(0.0, [0.0, 0.0, PI])) < CLOSE);
+        }
+    }
+
+    #[test]
+    fn exp_matches_a_turn_about_a_point_and_log_undoes_it() {
+        // A quarter circle of radius 2 about the point (0, 2, 0).
+        let quarter = Twist { linear_m_s: Vector3::new(PI, 0.0, 0.0), angular_rad_s: Vector3::new(0.0, 0.0, 0.5 * PI) };
+        let moved = exp(&quarter, 1.0);
+        assert!((moved.translation.vector - Vector3::new(2.0, 2.0, 0.0)).norm() < CLOSE);
+        for scale in [0.0, 1e-9, 0.99e-4, 1.01e-4, 1e-2, 1.0, 2.4] {
+            let twist =
+                Twist { linear_m_s: Vector3::new(0.3, -0.2, 0.5), angular_rad_s: Vector3::new(0.6, -0.7, 0.5) * scale };
+            let back = log(&exp(&twist, 0.5), 0.5);
+            assert!((back.linear_m_s - twist.linear_m_s).norm() < CLOSE, "{scale}");
+            assert!((back.angular_rad_s - twist.angular_rad_s).norm() < CLOSE, "{scale}");
+            let halves = exp(&twist, 0.25) * exp(&twist, 0.25);
+            assert!(distance(&halves, &exp(&twist, 0.5)) < CLOSE, "{scale}");
+        }
+    }
+
+    #[test]
+    fn an_attached_frame_keeps_the_same_motion() {
+        let twist = Twist { linear_m_s: Vector3::new(0.3, -0.2, 0.5), angular_rad_s: Vector3::new(1.0, 0.4, -0.3) };
+        let this_from_other = pose(0.2, [0.5, 0.1, -0.9]);
+        let moved = this_from_other.inverse() * exp(&twist, 0.7) * this_from_other;
+        assert!(distance(&exp(&twist.of_attached(&this_from_other), 0.7), &moved) < CLOSE);
+    }
+
+    #[test]
+    fn a_resting_point_moves_against_the_frame() {
+        const STEP_SECS: f64 = 1e-6;
+        let twist = Twist { linear_m_s: Vector3::new(0.3, -0.2, 0.5), angular_rad_s: Vector3::new(1.0, 0.4, -0.3) };
+        let point_in_frame = Vector3::new(0.1, 0.5, 0.9);
+        let at = |secs: f64| (exp(&twist, secs).inverse() * nalgebra::Point3::from(point_in_frame)).coords;
+        let numeric = (at(STEP_SECS) - at(-STEP_SECS)) / (2.0 * STEP_SECS);
+        assert!((numeric - twist.apparent_velocity(&point_in_frame)).norm() < 1e-9);
+    }
 }

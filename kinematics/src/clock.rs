@@ -1,0 +1,393 @@
+//! A device's clock mapped to ours by what arrives when.
+
+use crate::Stamp;
+use std::collections::VecDeque;
+
+/// Maps stamps of one device's clock to our monotonic clock.
+///
+/// Every arrival is `device * (1 + drift) + offset + latency`, where the latency is at least some fixed least one and
+/// often much more. So all arrivals lie above a line, and the map is the highest such line, in the sense of Moon, Skelly
+/// and Towsley 1999 (section 4: the lower convex hull's edge across the mean device time). Late arrivals do not move it.
+/// The least latency itself cannot be seen and stays in the result: it is calibrated elsewhere.
+#[derive(Clone, Debug)]
+pub struct ClockMap {
+    /// First device stamp since the start or the last restart; device times are told relative to it.
+    origin: Option<Origin>,
+    /// The earliest arrival, relative to its device time, of each bucket of device time.
+    buckets: VecDeque<Bucket>,
+    line: Line,
+    newest_nanos: i64,
+    late_since_nanos: Option<i64>,
+    n_restarts: u64,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Origin {
+    device_nanos: i64,
+    arrival: Stamp,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Bucket {
+    index: i64,
+    /// Seconds of device time since the origin.
+    device_secs: f64,
+    /// Arrival minus device time, seconds, relative to the origin's.
+    delay_secs: f64,
+}
+
+/// `delay = offset + drift * device`, seconds since the origin.
+#[derive(Clone, Copy, Debug, Default)]
+struct Line {
+    offset_secs: f64,
+    drift: f64,
+}
+
+/// Each bucket keeps one arrival.
+const BUCKET_NANOS: i64 = 250_000_000;
+/// Arrivals older than this are forgotten, so that the map follows a drift that changes with temperature.
+const WINDOW_SECS: f64 = 60.0;
+/// No crystal in use is further off; slopes beyond come from latency.
+const MAX_DRIFT: f64 = 200e-6;
+/// Drift is believed in proportion to the time seen, fully from here on: before, latency looks like drift.
+const FULL_DRIFT_SECS: f64 = 20.0;
+/// A device stamp further back than this is a new start of its clock; less is disorder on the wire.
+const MAX_DISORDER_NANOS: i64 = 500_000_000;
+/// An arrival this far before the line, seconds, cannot be: the device clock jumped ahead.
+const MAX_EARLY_SECS: f64 = 0.25;
+/// When all arrivals for a while are this late, seconds, the device clock jumped back a little, or was held.
+const MAX_LATE_SECS: f64 = 1.0;
+/// That while.
+const LATE_FOR_NANOS: i64 = 3_000_000_000;
+
+const NANOS_PER_SEC: f64 = 1e9;
+
+impl Default for ClockMap {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl ClockMap {
+    /// A map that knows nothing yet.
+    pub fn new() -> Self {
+        Self {
+            origin: None,
+            buckets: VecDeque::new(),
+            line: Line::default(),
+            newest_nanos: i64::MIN,
+            late_since_nanos: None,
+            n_restarts: 0,
+        }
+    }
+
+    /// Learns from one message: the device's stamp on it, and when it arrived here.
+    pub fn observe(&mut self, device_nanos: i64, arrival: Stamp) {
+        let Some(origin) = self.origin else {
+            return self.start(device_nanos, arrival);
+        };
+        if device_nanos < self.newest_nanos.saturating_sub(MAX_DISORDER_NANOS) {
+            return self.restart(device_nanos, arrival);
+        }
+        self.newest_nanos = self.newest_nanos.max(device_nanos);
+        let since_nanos = device_nanos.saturating_sub(origin.device_nanos);
+        let device_secs = since_nanos as f64 / NANOS_PER_SEC;
+        let delay_secs = arrival.nanos_since(origin.arrival).saturating_sub(since_nanos) as f64 / NANOS_PER_SEC;
+        let above_secs = delay_secs - self.line.at(device_secs);
+        // The first arrival of all may have been late by any amount, so early ones are judged once a line has formed.
+        let settled = self.buckets.len() > 4;
+        if settled && above_secs < -MAX_EARLY_SECS {
+            return self.restart(device_nanos, arrival);
+        }
+        if self.late_for_too_long(above_secs, arrival) {
+            return self.restart(device_nanos, arrival);
+        }
+        if self.keep(Bucket { index: since_nanos.div_euclid(BUCKET_NANOS), device_secs, delay_secs }) {
+            self.line = self.fit();
+        }
+    }
+
+    /// Our time of a device stamp; none before the first message.
+    ///
+    /// The least latency of the connection is part of it. Stamps may be mapped a little earlier than before once a quicker
+    /// message has been seen, so two stamps close together can change order while the map is young.
+    #[expect(clippy::cast_possible_truncation, reason = "a float to integer cast saturates")]
+    pub fn map(&self, device_nanos: i64) -> Option<Stamp> {
+        let origin = self.origin?;
+        let since_nanos = device_nanos.saturating_sub(origin.device_nanos);
+        let delay_nanos = self.line.at(since_nanos as f64 / NANOS_PER_SEC) * NANOS_PER_SEC;
+        let mapped = origin.arrival.0.saturating_add(since_nanos).saturating_add(delay_nanos.round() as i64);
+        Some(Stamp(mapped))
+    }
+
+    /// Learns from one message and tells its time; never later than its arrival.
+    pub fn stamp(&mut self, device_nanos: i64, arrival: Stamp) -> Stamp {
+        self.observe(device_nanos, arrival);
+        self.map(device_nanos).map_or(arrival, |mapped| mapped.min(arrival))
+    }
+
+    /// How much faster our clock runs than the device's, as a share (1e-6 is one part in a million).
+    pub fn drift(&self) -> f64 {
+        self.line.drift
+    }
+
+    /// How often the device's clock was found to have started again or jumped.
+    pub fn n_restarts(&self) -> u64 {
+        self.n_restarts
+    }
+
+    fn start(&mut self, device_nanos: i64, arrival: Stamp) {
+        self.origin = Some(Origin { device_nanos, arrival });
+        self.newest_nanos = device_nanos;
+        self.late_since_nanos = None;
+        self.line = Line::default();
+        self.buckets.clear();
+        self.buckets.push_back(Bucket { index: 0, device_secs: 0.0, delay_secs: 0.0 });
+    }
+
+    fn restart(&mut self, device_nanos: i64, arrival: Stamp) {
+        self.n_restarts += 1;
+        self.start(device_nanos, arrival);
+    }
+
+    fn late_for_too_long(&mut self, above_secs: f64, arrival: Stamp) -> bool {
+        if above_secs < MAX_LATE_SECS {
+            self.late_since_nanos = None;
+            return false;
+        }
+        arrival.0.saturating_sub(*self.late_since_nanos.get_or_insert(arrival.0)) > LATE_FOR_NANOS
+    }
+
+    /// Takes an arrival into its bucket; whether anything changed.
+    fn keep(&mut self, new: Bucket) -> bool {
+        let at = self.buckets.partition_point(|bucket| bucket.index < new.index);
+        match self.buckets.get_mut(at) {
+            None => self.buckets.push_back(new),
+            Some(known) if known.index == new.index && new.delay_secs < known.delay_secs => *known = new,
+            Some(_) => return false,
+        }
+        let oldest_secs = new.device_secs - WINDOW_SECS;
+        while self.buckets.front().is_some_and(|bucket| bucket.device_secs < oldest_secs) {
+            self.buckets.pop_front();
+        }
+        true
+    }
+
+    fn fit(&self) -> Line {
+        let span_secs = match (self.buckets.front(), self.buckets.back()) {
+            (Some(first), Some(last)) => last.device_secs - first.device_secs,
+            _ => return self.line,
+        };
+        let most = MAX_DRIFT * (span_secs / FULL_DRIFT_SECS).min(1.0);
+        let drift = self.hull_slope().clamp(-most, most);
+        let offset_secs = self.buckets.iter().map(|bucket| bucket.delay_secs - drift * bucket.device_secs);
+        Line { offset_secs: offset_secs.fold(f64::INFINITY, f64::min), drift }
+    }
+
+    /// Slope of the lower hull's edge that spans the mean device time.
+    fn hull_slope(&self) -> f64 {
+        let mean_secs = self.buckets.iter().map(|bucket| bucket.device_secs).sum::<f64>() / self.buckets.len() as f64;
+        let mut hull: Vec<&Bucket> = Vec::with_capacity(self.buckets.len());
+        for bucket in &self.buckets {
+            while let [.., a, b] = hull[..]
+                && slope(a, bucket) <= slope(a, b)
+            {
+                hull.pop();
+            }
+            hull.push(bucket);
+        }
+        let edge = hull.windows(2).find(|edge| edge[1].device_secs >= mean_secs);
+        edge.map_or(0.0, |edge| slope(edge[0], edge[1]))
+    }
+}
+
+impl Line {
+    fn at(&self, device_secs: f64) -> f64 {
+        self.offset_secs + self.drift * device_secs
+    }
+}
+
+fn slope(a: &Bucket, b: &Bucket) -> f64 {
+    (b.delay_secs - a.delay_secs) / (b.device_secs - a.device_secs)
+}
+
+/// Unwraps a device's 32-bit count of microseconds, which starts again every 71.6 minutes, to nanoseconds.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct WrappingMicros {
+    last: Option<(u32, i64)>,
+}
+
+impl WrappingMicros {
+    /// An unwrapper that has seen nothing; its first result is the count itself.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// The count as nanoseconds that go on growing, taking each count as the one within 35 minutes of the count before.
+    pub fn nanos(&mut self, micros: u32) -> i64 {
+        const NANOS_PER_MICRO: i64 = 1000;
+        let total = match self.last {
+            None => i64::from(micros),
+            Some((last, total)) => total + i64::from(micros.wrapping_sub(last).cast_signed()),
+        };
+        self.last = Some((micros, total));
+        total * NANOS_PER_MICRO
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![expect(clippy::cast_possible_truncation, reason = "test numbers lie well inside the integers' ranges")]
+
+    use super::*;
+
+    const FIXED_NANOS: i64 = 5_000_000;
+    const JITTER_NANOS: f64 = 75e6;
+    const DRIFT: f64 = 50e-6;
+
+    /// A device that sends at a fixed rate over a bad connection; all its numbers come from one seed.
+    struct Device {
+        rate_hz: f64,
+        random: u64,
+        clock_starts: i64,
+    }
+
+    impl Device {
+        fn new(rate_hz: f64, seed: u64) -> Self {
+            Self { rate_hz, random: seed, clock_starts: 9_876_543_210 }
+        }
+
+        fn uniform(&mut self) -> f64 {
+            self.random = self.random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (self.random >> 11) as f64 / (1_u64 << 53) as f64
+        }
+
+        /// True time, device time and arrival of the message at `ix`, in nanoseconds.
+        fn message(&mut self, ix: u32) -> (i64, i64, Stamp) {
+            let truth = (f64::from(ix) / self.rate_hz * 1e9) as i64;
+            let device = self.clock_starts + (truth as f64 / (1.0 + DRIFT)) as i64;
+            let arrival = truth + FIXED_NANOS + (self.uniform() * JITTER_NANOS) as i64;
+            (truth, device, Stamp(arrival))
+        }
+    }
+
+    /// Worst error from `settled_secs` to the end, nanoseconds, with the fixed latency taken away.
+    fn worst_error(clock: &mut ClockMap, device: &mut Device, secs: f64, settled_secs: f64) -> i64 {
+        let n_messages = (secs * device.rate_hz) as u32;
+        let mut worst = 0;
+        for ix in 0..n_messages {
+            let (truth, stamped, arrival) = device.message(ix);
+            let mapped = clock.stamp(stamped, arrival);
+            assert!(mapped <= arrival);
+            if truth as f64 > settled_secs * 1e9 {
+                worst = worst.max((mapped.0 - FIXED_NANOS - truth).abs());
+            }
+        }
+        worst
+    }
+
+    #[test]
+    fn jitter_and_drift_are_filtered_to_a_millisecond() {
+        const CLOSE_NANOS: i64 = 1_000_000;
+        for seed in 1..=20 {
+            for (rate_hz, settled_secs) in [(1000.0, 2.0), (200.0, 6.0)] {
+                let mut clock = ClockMap::new();
+                let worst = worst_error(&mut clock, &mut Device::new(rate_hz, seed), 150.0, settled_secs);
+                assert!(worst < CLOSE_NANOS, "{rate_hz} Hz, seed {seed}: {} us off", worst / 1000);
+                assert!((clock.drift() - DRIFT).abs() < 20e-6, "{rate_hz} Hz, seed {seed}: drift {}", clock.drift());
+                assert_eq!(clock.n_restarts(), 0);
+            }
+        }
+    }
+
+    #[test]
+    fn a_clock_without_jitter_is_followed_exactly() {
+        let mut clock = ClockMap::new();
+        assert_eq!(clock.map(5), None);
+        for ix in 0..1000 {
+            let device = ix * 10_000_000;
+            clock.observe(device, Stamp(device + 77));
+        }
+        assert_eq!(clock.map(123_456_789), Some(Stamp(123_456_866)));
+        assert_eq!(clock.drift(), 0.0);
+    }
+
+    #[test]
+    fn a_restarted_device_clock_is_noticed_and_learnt_anew() {
+        // Back to zero, far ahead, and back by less than it ran.
+        for jump_nanos in [-70_000_000_000, 3_600_000_000_000, -4_000_000_000] {
+            let mut device = Device::new(200.0, 7);
+            let mut clock = ClockMap::new();
+            for ix in 0..12_000 {
+                let (_, stamped, arrival) = device.message(ix);
+                clock.observe(stamped, arrival);
+            }
+            assert_eq!(clock.n_restarts(), 0);
+            device.clock_starts += jump_nanos;
+            for ix in 12_000..14_000 {
+                let (truth, stamped, arrival) = device.message(ix);
+                let mapped = clock.stamp(stamped, arrival);
+                if ix >= 13_500 {
+                    let off = (mapped.0 - FIXED_NANOS - truth).abs();
+                    assert!(off < 1_000_000, "jump {jump_nanos}: {} us off", off / 1000);
+                }
+            }
+            assert_eq!(clock.n_restarts(), 1, "jump {jump_nanos}");
+        }
+    }
+
+    #[test]
+    fn a_small_step_back_is_found_by_lasting_lateness() {
+        let mut clock = ClockMap::new();
+        let send = |clock: &mut ClockMap, ms: i64, behind_ms: i64| {
+            clock.stamp((ms - behind_ms) * 1_000_000, Stamp(ms * 1_000_000)).0 - ms * 1_000_000
+        };
+        for ix in 0..500 {
+            assert_eq!(send(&mut clock, ix * 10, 0), 0);
+        }
+        // The device was held for three seconds together with its clock: every stamp is 3 s behind, none goes backwards.
+        for ix in 800..1200 {
+            send(&mut clock, ix * 10, 3000);
+        }
+        assert_eq!(clock.n_restarts(), 1);
+        assert_eq!(send(&mut clock, 12_010, 3000), 0);
+    }
+
+    #[test]
+    fn a_stall_of_the_connection_changes_nothing() {
+        let mut clock = ClockMap::new();
+        for ix in 0..1000_i64 {
+            let device = ix * 10_000_000;
+            // Everything sent in the third second arrives at its end.
+            let sent = if (200..300).contains(&ix) { 3_000_000_000 } else { device };
+            clock.observe(device, Stamp(sent + 77));
+        }
+        assert_eq!(clock.n_restarts(), 0);
+        assert_eq!(clock.map(5_000_000_000), Some(Stamp(5_000_000_077)));
+    }
+
+    #[test]
+    fn disorder_on_the_wire_is_no_restart() {
+        let mut clock = ClockMap::new();
+        for ix in 0..1000_i64 {
+            let device = (ix ^ 1) * 10_000_000;
+            clock.observe(device, Stamp(ix.max(ix ^ 1) * 10_000_000));
+        }
+        assert_eq!(clock.n_restarts(), 0);
+        assert_eq!(clock.map(1_000_000_000), Some(Stamp(1_000_000_000)));
+    }
+
+    #[test]
+    fn microseconds_go_on_past_32_bits() {
+        let mut wrapping = WrappingMicros::new();
+        assert_eq!(wrapping.nanos(u32::MAX - 1), 4_294_967_294_000);
+        assert_eq!(wrapping.nanos(1), 4_294_967_297_000);
+        assert_eq!(wrapping.nanos(0), 4_294_967_296_000);
+        let mut micros = 0_u32;
+        for _ in 0..10 {
+            micros = micros.wrapping_add(1_000_000_000);
+            wrapping.nanos(micros);
+        }
+        assert_eq!(wrapping.nanos(micros), (4_294_967_296 + 10_000_000_000) * 1000);
+    }
+}

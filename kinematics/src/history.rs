@@ -1,0 +1,374 @@
+//! What the joints and the base were at a given instant: interpolated between readings, never beyond them.
+
+use crate::{JointState, Stamp, Transform, transform};
+use std::collections::VecDeque;
+use std::time::Duration;
+
+/// Why a history cannot tell, or did not take a reading.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum HistoryError {
+    /// The newest reading is older than the stamp: ask again when more have come.
+    #[error("no reading as late as the stamp asked for yet{}", .newest.map(|newest| behind(newest, *.asked)).unwrap_or_default())]
+    NotYet {
+        /// The newest reading; none when there is no reading at all.
+        newest: Option<Stamp>,
+        /// The stamp asked for.
+        asked: Stamp,
+    },
+    /// The stamp is before the oldest reading kept: it will never be known.
+    #[error("the stamp asked for is {:.3} s before the oldest reading kept", .oldest.secs_since(*.asked))]
+    TooOld {
+        /// The oldest reading kept.
+        oldest: Stamp,
+        /// The stamp asked for.
+        asked: Stamp,
+    },
+    /// The readings on both sides lie too far apart to interpolate: it will never be known.
+    #[error("readings are missing for {:.1} ms around the stamp asked for (at most {:.1} ms)", .after.secs_since(*.before) * 1e3, .max_gap.as_secs_f64() * 1e3)]
+    Gap {
+        /// The last reading before the stamp.
+        before: Stamp,
+        /// The first reading after the stamp.
+        after: Stamp,
+        /// The longest distance allowed.
+        max_gap: Duration,
+    },
+    /// A reading pushed is not later than the newest one; it was dropped.
+    #[error("reading is {:.3} ms older than the newest one, dropped", .newest.secs_since(*.pushed) * 1e3)]
+    OutOfOrder {
+        /// The newest reading kept.
+        newest: Stamp,
+        /// The stamp of the one pushed.
+        pushed: Stamp,
+    },
+    /// A reading pushed holds NaN or infinity; it was dropped.
+    #[error("reading holds a number that is not finite, dropped")]
+    NotFinite,
+    /// A reading pushed has another number of joints than those before; it was dropped.
+    #[error("reading of {got} joints, those before had {expected}, dropped")]
+    JointCount {
+        /// Joints in the reading.
+        got: usize,
+        /// Joints in the readings before.
+        expected: usize,
+    },
+}
+
+fn behind(newest: Stamp, asked: Stamp) -> String {
+    format!(" (the newest is {:.1} ms older)", asked.secs_since(newest) * 1e3)
+}
+
+/// Stamped readings in order, the oldest falling out.
+#[derive(Clone, Debug)]
+struct Readings<T> {
+    max_gap: Duration,
+    capacity: usize,
+    kept: VecDeque<(Stamp, T)>,
+    n_refused: u64,
+}
+
+/// Two neighbours and where between them the stamp lies; the same one twice where it meets a reading.
+struct Between<'a, T> {
+    before: (Stamp, &'a T),
+    after: (Stamp, &'a T),
+    frac: f64,
+}
+
+impl<T> Readings<T> {
+    fn new(max_gap: Duration, capacity: usize) -> Self {
+        Self { max_gap, capacity: capacity.max(2), kept: VecDeque::new(), n_refused: 0 }
+    }
+
+    fn push(&mut self, stamp: Stamp, reading: T) -> Result<(), HistoryError> {
+        if let Some(&(newest, _)) = self.kept.back()
+            && stamp <= newest
+        {
+            return self.refuse(HistoryError::OutOfOrder { newest, pushed: stamp });
+        }
+        if self.kept.len() == self.capacity {
+            self.kept.pop_front();
+        }
+        self.kept.push_back((stamp, reading));
+        Ok(())
+    }
+
+    fn refuse(&mut self, why: HistoryError) -> Result<(), HistoryError> {
+        self.n_refused += 1;
+        Err(why)
+    }
+
+    fn around(&self, asked: Stamp) -> Result<Between<'_, T>, HistoryError> {
+        let (Some((oldest, _)), Some((newest, _))) = (self.kept.front(), self.kept.back()) else {
+            return Err(HistoryError::NotYet { newest: None, asked });
+        };
+        if asked > *newest {
+            return Err(HistoryError::NotYet { newest: Some(*newest), asked });
+        }
+        if asked < *oldest {
+            return Err(HistoryError::TooOld { oldest: *oldest, asked });
+        }
+        let after_ix = self.kept.partition_point(|(stamp, _)| *stamp < asked);
+        let (after, later) = &self.kept[after_ix];
+        if *after == asked {
+            return Ok(Between { before: (*after, later), after: (*after, later), frac: 0.0 });
+        }
+        let (before, earlier) = &self.kept[after_ix - 1];
+        if after.duration_since(*before) > self.max_gap {
+            return Err(HistoryError::Gap { before: *before, after: *after, max_gap: self.max_gap });
+        }
+        let frac = asked.secs_since(*before) / after.secs_since(*before);
+        Ok(Between { before: (*before, earlier), after: (*after, later), frac })
+    }
+
+    fn newest(&self) -> Option<Stamp> {
+        self.kept.back().map(|(stamp, _)| *stamp)
+    }
+
+    fn oldest(&self) -> Option<Stamp> {
+        self.kept.front().map(|(stamp, _)| *stamp)
+    }
+}
+
+/// Joint readings of one arm over the last while.
+#[derive(Clone, Debug)]
+pub struct JointHistory {
+    readings: Readings<JointState>,
+}
+
+impl JointHistory {
+    /// Keeps the newest `capacity` readings (at least 2) and interpolates between neighbours at most `max_gap` apart.
+    pub fn new(max_gap: Duration, capacity: usize) -> Self {
+        Self { readings: Readings::new(max_gap, capacity) }
+    }
+
+    /// Adds a reading later than all before it. Anything else is dropped, counted, and told.
+    pub fn push(&mut self, state: JointState) -> Result<(), HistoryError> {
+        let numbers = || state.position.iter().chain(&state.velocity).chain(&state.effort);
+        if !numbers().all(|number| number.is_finite()) {
+            return self.readings.refuse(HistoryError::NotFinite);
+        }
+        if let Some((_, last)) = self.readings.kept.back()
+            && last.position.len() != state.position.len()
+        {
+            let expected = last.position.len();
+            return self.readings.refuse(HistoryError::JointCount { got: state.position.len(), expected });
+        }
+        self.readings.push(state.stamp, state)
+    }
+
+    /// The joints at a stamp.
+    ///
+    /// Positions follow a cubic through both neighbours' positions and velocities, or a line where velocities are not told;
+    /// velocities are the slope of that curve, efforts lie on a line. A stamp that meets a reading gives that reading.
+    pub fn at(&self, stamp: Stamp) -> Result<JointState, HistoryError> {
+        let Between { before: (before, a), after: (after, b), frac } = self.readings.around(stamp)?;
+        if before == after {
+            return Ok(a.clone());
+        }
+        let span_secs = after.secs_since(before);
+        let n_joints = a.position.len();
+        let smooth = a.velocity.len() == n_joints && b.velocity.len() == n_joints;
+        let curve = |joint: usize| {
+            let (from, to) = (a.position[joint], b.position[joint]);
+            match smooth {
+                true => hermite([from, to], [a.velocity[joint], b.velocity[joint]], span_secs, frac),
+                false => (from + (to - from) * frac, (to - from) / span_secs),
+            }
+        };
+        let (position, velocity) = (0..n_joints).map(curve).unzip();
+        let effort = a.effort.iter().zip(&b.effort).map(|(from, to)| from + (to - from) * frac).collect();
+        Ok(JointState { stamp, position, velocity, effort })
+    }
+
+    /// Stamp of the newest reading.
+    pub fn newest(&self) -> Option<Stamp> {
+        self.readings.newest()
+    }
+
+    /// Stamp of the oldest reading kept.
+    pub fn oldest(&self) -> Option<Stamp> {
+        self.readings.oldest()
+    }
+
+    /// Readings dropped because they came out of order or made no sense.
+    pub fn n_refused(&self) -> u64 {
+        self.readings.n_refused
+    }
+
+    /// Forgets all readings, for a device whose clock started again.
+    pub fn clear(&mut self) {
+        self.readings.kept.clear();
+    }
+}
+
+/// Position and slope of the cubic with the given ends and slopes at the ends, `frac` of the way.
+fn hermite([p0, p1]: [f64; 2], [v0, v1]: [f64; 2], span_secs: f64, frac: f64) -> (f64, f64) {
+    let (m0, m1, rise) = (v0 * span_secs, v1 * span_secs, p1 - p0);
+    let (second, third) = (3.0 * rise - 2.0 * m0 - m1, m0 + m1 - 2.0 * rise);
+    let position = p0 + frac * (m0 + frac * (second + frac * third));
+    let slope = m0 + frac * (2.0 * second + frac * 3.0 * third);
+    (position, slope / span_secs)
+}
+
+/// Poses of one body over the last while.
+#[derive(Clone, Debug)]
+pub struct PoseHistory {
+    readings: Readings<Transform>,
+}
+
+impl PoseHistory {
+    /// Keeps the newest `capacity` poses (at least 2) and interpolates between neighbours at most `max_gap` apart.
+    pub fn new(max_gap: Duration, capacity: usize) -> Self {
+        Self { readings: Readings::new(max_gap, capacity) }
+    }
+
+    /// Adds a pose later than all before it. Anything else is dropped, counted, and told.
+    pub fn push(&mut self, stamp: Stamp, pose: Transform) -> Result<(), HistoryError> {
+        let finite = transform::to_rows(&pose).iter().all(|number| number.is_finite());
+        if !finite {
+            return self.readings.refuse(HistoryError::NotFinite);
+        }
+        self.readings.push(stamp, pose)
+    }
+
+    /// The pose at a stamp, by [`transform::interpolate`].
+    pub fn at(&self, stamp: Stamp) -> Result<Transform, HistoryError> {
+        let around = self.readings.around(stamp)?;
+        if around.frac == 0.0 {
+            return Ok(*around.before.1);
+        }
+        Ok(transform::interpolate(around.before.1, around.after.1, around.frac))
+    }
+
+    /// Stamp of the newest pose.
+    pub fn newest(&self) -> Option<Stamp> {
+        self.readings.newest()
+    }
+
+    /// Stamp of the oldest pose kept.
+    pub fn oldest(&self) -> Option<Stamp> {
+        self.readings.oldest()
+    }
+
+    /// Poses dropped because they came out of order or were not finite.
+    pub fn n_refused(&self) -> u64 {
+        self.readings.n_refused
+    }
+
+    /// Forgets all poses, for a source whose clock started again.
+    pub fn clear(&mut self) {
+        self.readings.kept.clear();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Vector3;
+
+    const MAX_GAP: Duration = Duration::from_millis(20);
+
+    fn state(secs: f64, position: f64, velocity: Option<f64>) -> JointState {
+        JointState {
+            stamp: Stamp::from_secs(secs),
+            position: vec![position, -2.0 * position],
+            velocity: velocity.map(|velocity| vec![velocity, -2.0 * velocity]).unwrap_or_default(),
+            effort: vec![10.0 * position; 2],
+        }
+    }
+
+    fn history(states: impl IntoIterator<Item = JointState>) -> JointHistory {
+        let mut history = JointHistory::new(MAX_GAP, 100);
+        states.into_iter().for_each(|state| history.push(state).unwrap());
+        history
+    }
+
+    #[test]
+    fn a_cubic_motion_is_followed_exactly_when_velocities_are_told() {
+        let motion =
+            |secs: f64| (1.0 + secs - 3.0 * secs * secs + 20.0 * secs.powi(3), 1.0 - 6.0 * secs + 60.0 * secs * secs);
+        let readings = (0..10).map(|ix| f64::from(ix) * 0.02).map(|secs| {
+            let (position, velocity) = motion(secs);
+            state(secs, position, Some(velocity))
+        });
+        let history = history(readings);
+        for secs in [0.0, 0.013, 0.0999, 0.1, 0.17] {
+            let (position, velocity) = motion(secs);
+            let at = history.at(Stamp::from_secs(secs)).unwrap();
+            assert_eq!(at.stamp, Stamp::from_secs(secs));
+            for (got, wanted) in at.position.iter().zip([position, -2.0 * position]) {
+                assert!((got - wanted).abs() < 1e-12, "{secs}: {got} {wanted}");
+            }
+            assert!((at.velocity[1] + 2.0 * velocity).abs() < 1e-11, "{secs}"); // Rounding over the 20 ms between readings.
+        }
+    }
+
+    #[test]
+    fn without_velocities_the_way_is_a_line_and_its_slope_is_told() {
+        let history = history([state(1.0, 0.5, None), state(1.02, 0.7, None)]);
+        let at = history.at(Stamp::from_secs(1.005)).unwrap();
+        assert!((at.position[0] - 0.55).abs() < 1e-12 && (at.position[1] + 1.1).abs() < 1e-12);
+        assert!((at.velocity[0] - 10.0).abs() < 1e-9);
+        assert!((at.effort[0] - 5.5).abs() < 1e-12);
+        assert_eq!(history.at(Stamp::from_secs(1.02)).unwrap(), state(1.02, 0.7, None));
+    }
+
+    #[test]
+    fn nothing_is_told_beyond_the_readings_and_the_reasons_differ() {
+        let empty = JointHistory::new(MAX_GAP, 3);
+        assert!(matches!(empty.at(Stamp(0)), Err(HistoryError::NotYet { newest: None, .. })));
+        let mut history = JointHistory::new(MAX_GAP, 3);
+        for secs in [1.0, 1.01, 1.02, 1.05] {
+            history.push(state(secs, secs, None)).unwrap();
+        }
+        let ask = |secs: f64| history.at(Stamp::from_secs(secs));
+        assert_eq!(history.oldest(), Some(Stamp::from_secs(1.01)));
+        assert!(matches!(ask(1.05001), Err(HistoryError::NotYet { newest: Some(_), .. })));
+        assert!(matches!(ask(1.00999), Err(HistoryError::TooOld { .. })));
+        assert!(matches!(ask(1.03), Err(HistoryError::Gap { .. })));
+        assert_eq!(
+            ask(1.03).unwrap_err().to_string(),
+            "readings are missing for 30.0 ms around the stamp asked for (at most 20.0 ms)"
+        );
+        // Readings at the edges of a gap and of the history are known.
+        for secs in [1.01, 1.015, 1.02, 1.05] {
+            assert!(ask(secs).is_ok(), "{secs}");
+        }
+    }
+
+    #[test]
+    fn readings_out_of_order_or_broken_are_dropped_and_counted() {
+        let mut history = history([state(1.0, 0.5, None), state(1.01, 0.6, None)]);
+        let late = history.push(state(1.005, 9.0, None));
+        assert!(matches!(late, Err(HistoryError::OutOfOrder { .. })));
+        assert!(matches!(history.push(state(1.01, 9.0, None)), Err(HistoryError::OutOfOrder { .. })));
+        assert_eq!(history.push(state(1.02, f64::NAN, None)), Err(HistoryError::NotFinite));
+        let short = JointState { position: vec![0.0], ..state(1.02, 0.0, None) };
+        assert_eq!(history.push(short), Err(HistoryError::JointCount { got: 1, expected: 2 }));
+        assert_eq!(history.n_refused(), 4);
+        assert_eq!(history.newest(), Some(Stamp::from_secs(1.01)));
+        assert!((history.at(Stamp::from_secs(1.005)).unwrap().position[0] - 0.55).abs() < 1e-12);
+        history.clear();
+        assert!(history.push(state(0.0, 0.0, None)).is_ok());
+    }
+
+    #[test]
+    fn poses_follow_the_same_rules() {
+        let pose = |x: f64| Transform::new(Vector3::new(x, 0.0, 0.0), Vector3::new(0.0, 0.0, x));
+        let mut history = PoseHistory::new(MAX_GAP, 10);
+        history.push(Stamp::from_secs(1.0), pose(0.0)).unwrap();
+        history.push(Stamp::from_secs(1.02), pose(1.0)).unwrap();
+        history.push(Stamp::from_secs(1.1), pose(2.0)).unwrap();
+        let at = history.at(Stamp::from_secs(1.005)).unwrap();
+        assert!((at.to_homogeneous() - pose(0.25).to_homogeneous()).abs().max() < 1e-12);
+        assert_eq!(history.at(Stamp::from_secs(1.1)).unwrap(), pose(2.0));
+        assert!(matches!(history.at(Stamp::from_secs(1.05)), Err(HistoryError::Gap { .. })));
+        assert!(matches!(history.at(Stamp::from_secs(1.2)), Err(HistoryError::NotYet { .. })));
+        assert!(matches!(history.at(Stamp::from_secs(0.9)), Err(HistoryError::TooOld { .. })));
+        let broken = pose(f64::NAN);
+        assert_eq!(history.push(Stamp::from_secs(2.0), broken), Err(HistoryError::NotFinite));
+        assert!(history.push(Stamp::from_secs(1.05), pose(0.0)).is_err());
+        assert_eq!(history.n_refused(), 2);
+    }
+}

@@ -1,0 +1,239 @@
+//! Distortion of the plane `z = 1` by a lens, its derivative and its inverse.
+
+use nalgebra::{Matrix2, Vector2};
+
+/// Where a lens puts a point of the plane `z = 1`, and how that moves with the point.
+pub(crate) struct Distorted {
+    pub(crate) value: Vector2<f64>,
+    pub(crate) jacobian: Matrix2<f64>,
+}
+
+impl Distorted {
+    pub(crate) fn none(plane: Vector2<f64>) -> Self {
+        Self { value: plane, jacobian: Matrix2::identity() }
+    }
+}
+
+/// Newton stops when the step is below this share of the value, just above rounding.
+const CONVERGED: f64 = 1e-15;
+
+/// Brown 1966 and Conrady 1919, in OpenCV's form; none beyond the radius where the radial part turns back.
+pub(crate) fn brown_conrady(k: &[f64; 5], plane: Vector2<f64>) -> Option<Distorted> {
+    let distorted = brown_conrady_unchecked(k, plane);
+    let monotonic = positive_on(&radial_slope(k), plane.norm_squared()) && distorted.jacobian.determinant() > 0.0;
+    monotonic.then_some(distorted)
+}
+
+fn brown_conrady_unchecked(&[k1, k2, p1, p2, k3]: &[f64; 5], plane: Vector2<f64>) -> Distorted {
+    let (x, y) = (plane.x, plane.y);
+    let r2 = plane.norm_squared();
+    let radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
+    let radial_by_r2 = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3);
+    let value = Vector2::new(
+        x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+        y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+    );
+    let across = 2.0 * (x * y * radial_by_r2 + p1 * x + p2 * y);
+    let jacobian = Matrix2::new(
+        radial + 2.0 * (x * x * radial_by_r2 + p1 * y + 3.0 * p2 * x),
+        across,
+        across,
+        radial + 2.0 * (y * y * radial_by_r2 + 3.0 * p1 * y + p2 * x),
+    );
+    Distorted { value, jacobian }
+}
+
+/// Slope of `r (1 + k1 r2 + k2 r4 + k3 r6)` by r, as a polynomial in r2.
+fn radial_slope(&[k1, k2, _, _, k3]: &[f64; 5]) -> [f64; 5] {
+    [1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3, 0.0]
+}
+
+/// The point that [`brown_conrady`] puts at `distorted`.
+pub(crate) fn undo_brown_conrady(k: &[f64; 5], distorted: Vector2<f64>) -> Option<Vector2<f64>> {
+    const MAX_STEPS: usize = 50;
+    let length = distorted.norm();
+    if length == 0.0 && k[2] == 0.0 && k[3] == 0.0 {
+        return Some(distorted);
+    }
+    // Without the tangential part one dimension suffices; with it, that answer starts Newton's method in the plane.
+    let radial = [1.0, k[0], k[1], k[4], 0.0];
+    let mut plane = match undo_odd_polynomial(&radial, &radial_slope(k), length, f64::INFINITY) {
+        Some(radius) if length > 0.0 => distorted * (radius / length),
+        Some(_) => distorted,
+        // Just outside the radial limit the tangential part may still bring the point in.
+        None if k[2] != 0.0 || k[3] != 0.0 => distorted,
+        None => return None,
+    };
+    for _ in 0..MAX_STEPS {
+        let guess = brown_conrady_unchecked(k, plane);
+        let step = guess.jacobian.try_inverse()? * (guess.value - distorted);
+        plane -= step;
+        if step.norm() <= CONVERGED * (1.0 + plane.norm()) {
+            break;
+        }
+    }
+    let check = brown_conrady(k, plane)?;
+    const CLOSE: f64 = 1e-12;
+    ((check.value - distorted).norm() <= CLOSE * (1.0 + length)).then_some(plane)
+}
+
+/// Kannala and Brandt 2006, equation 6, radial terms only, as in OpenCV's fisheye model.
+pub(crate) fn kannala_brandt(k: &[f64; 4], plane: Vector2<f64>) -> Option<Distorted> {
+    let radius = plane.norm();
+    let angle = radius.atan();
+    let angle2 = angle * angle;
+    if !positive_on(&angle_slope(k), angle2) {
+        return None;
+    }
+    let series = 1.0 + angle2 * (k[0] + angle2 * (k[1] + angle2 * (k[2] + angle2 * k[3])));
+    let length = angle * series;
+    let length_by_radius = evaluate(&angle_slope(k), angle2) / (1.0 + radius * radius);
+    // length / radius and its slope over radius; near the axis both quotients lose all digits, and the map is the identity
+    // up to the third order.
+    const NEAR_AXIS: f64 = 1e-6;
+    let (share, share_by_radius2) = if radius < NEAR_AXIS {
+        (1.0 + (k[0] - 1.0 / 3.0) * radius * radius, 2.0 * (k[0] - 1.0 / 3.0))
+    } else {
+        (length / radius, (length_by_radius - length / radius) / (radius * radius))
+    };
+    let jacobian = Matrix2::identity() * share + plane * plane.transpose() * share_by_radius2;
+    Some(Distorted { value: plane * share, jacobian })
+}
+
+/// Slope of `angle (1 + k1 angle2 + ...)` by the angle, as a polynomial in angle2.
+fn angle_slope(&[k1, k2, k3, k4]: &[f64; 4]) -> [f64; 5] {
+    [1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3, 9.0 * k4]
+}
+
+/// The point that [`kannala_brandt`] puts at `distorted`; none at 90 degrees from the axis and more.
+pub(crate) fn undo_kannala_brandt(k: &[f64; 4], distorted: Vector2<f64>) -> Option<Vector2<f64>> {
+    let length = distorted.norm();
+    if length == 0.0 {
+        return Some(distorted);
+    }
+    let series = [1.0, k[0], k[1], k[2], k[3]];
+    let angle = undo_odd_polynomial(&series, &angle_slope(k), length, std::f64::consts::FRAC_PI_2)?;
+    (angle < std::f64::consts::FRAC_PI_2).then(|| distorted * (angle.tan() / length))
+}
+
+/// The smallest `x` from 0 to `limit` with `x p(x²) = target`, where the slope is positive all the way from 0 to it.
+///
+/// Newton's method inside a bracket that every step narrows.
+fn undo_odd_polynomial(p: &[f64; 5], slope: &[f64; 5], target: f64, limit: f64) -> Option<f64> {
+    const MAX_STEPS: usize = 200; // Bisection alone needs about 60 from any bracket.
+    let value = |x: f64| x * evaluate(p, x * x) - target;
+    // First a bracket: x from `low`, where the value is below, to `high`, where it is above or the slope has turned.
+    let (mut low, mut high) = (0.0, target.min(limit));
+    let rising_to = |x: f64| positive_on(slope, x * x);
+    while rising_to(high) && value(high) < 0.0 {
+        if high >= limit || high > f64::MAX.sqrt() * 0.25 {
+            return None;
+        }
+        low = high;
+        high = (2.0 * high).min(limit);
+    }
+    // Now narrow it.
+    let mut x = 0.5 * (low + high);
+    for _ in 0..MAX_STEPS {
+        let rising = rising_to(x);
+        if rising && value(x) < 0.0 {
+            low = x;
+        } else {
+            high = x;
+        }
+        // Beyond the turn Newton's method could settle on another root.
+        let newton = x - value(x) / evaluate(slope, x * x);
+        let next = if rising && newton > low && newton < high { newton } else { 0.5 * (low + high) };
+        let step = (next - x).abs();
+        x = next;
+        if step <= CONVERGED * x || high - low <= CONVERGED * high {
+            break;
+        }
+    }
+    const CLOSE: f64 = 1e-12;
+    (rising_to(x) && value(x).abs() <= CLOSE * target.max(1.0)).then_some(x)
+}
+
+fn evaluate(p: &[f64; 5], s: f64) -> f64 {
+    p[0] + s * (p[1] + s * (p[2] + s * (p[3] + s * p[4])))
+}
+
+/// Whether a polynomial of degree 4 with `p[0] > 0` is positive from 0 to `end`.
+///
+/// Its Bernstein coefficients on the span bound it from below; where they do not decide, the span is halved
+/// (Lane and Riesenfeld 1981). A lens within its range is decided by the first look.
+fn positive_on(p: &[f64; 5], end: f64) -> bool {
+    const MAX_HALVINGS: u32 = 30;
+    let mut power = [p[0], p[1] * end, 0.0, 0.0, 0.0];
+    let mut scale = end;
+    for degree in 2..5 {
+        scale *= end;
+        power[degree] = p[degree] * scale;
+    }
+    // Coefficient j is the sum over i <= j of choose(j, i) / choose(4, i) * power[i].
+    let [c0, c1, c2, c3, c4] = power;
+    let bernstein =
+        [c0, c0 + c1 / 4.0, c0 + c1 / 2.0 + c2 / 6.0, c0 + 0.75 * c1 + c2 / 2.0 + c3 / 4.0, c0 + c1 + c2 + c3 + c4];
+    all_positive(&bernstein, MAX_HALVINGS)
+}
+
+fn all_positive(bernstein: &[f64; 5], halvings_left: u32) -> bool {
+    if bernstein.iter().all(|&coefficient| coefficient > 0.0) {
+        return true;
+    }
+    // The ends are values of the polynomial itself. Written so that NaN is not positive.
+    if !(bernstein[0] > 0.0 && bernstein[4] > 0.0) || halvings_left == 0 {
+        return false;
+    }
+    let (mut left, mut right) = ([0.0; 5], *bernstein);
+    for (level, first) in left.iter_mut().enumerate() {
+        *first = right[0];
+        for at in 0..4 - level {
+            right[at] = 0.5 * (right[at] + right[at + 1]);
+        }
+    }
+    // What is left in `right` after de Casteljau's steps is the right half, read from the outside in.
+    all_positive(&left, halvings_left - 1) && all_positive(&right, halvings_left - 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn positive_polynomials_are_told_from_those_that_dip() {
+        // (s - 1)² + dip has its minimum, dip, at 1.
+        let parabola = |dip: f64| [1.0 + dip, -2.0, 1.0, 0.0, 0.0];
+        assert!(positive_on(&parabola(1e-3), 5.0));
+        assert!(!positive_on(&parabola(-1e-3), 5.0));
+        assert!(positive_on(&parabola(-1e-3), 0.9));
+        // (s - 0.5)² (s - 2)² + dip has two.
+        let quartic = |dip: f64| [1.0 + dip, -5.0, 8.25, -5.0, 1.0];
+        assert!(positive_on(&quartic(1e-3), 3.0));
+        assert!(!positive_on(&quartic(-1e-3), 3.0));
+        assert!(!positive_on(&quartic(-1e-3), 1.0));
+        assert!(positive_on(&quartic(-1e-3), 0.4));
+        assert!(!positive_on(&[1.0, f64::NAN, 0.0, 0.0, 0.0], 1.0));
+        assert!(positive_on(&[1.0, 0.0, 0.0, 0.0, 0.0], 1e60));
+    }
+
+    #[test]
+    fn strong_lenses_are_undone_up_to_their_limit() {
+        for k in [[-0.3, 0.1, 0.0, 0.0, 0.0], [-0.4, 0.0, 0.003, -0.002, 0.0], [0.5, -0.9, 0.0, 0.0, 0.3], [0.9; 5]] {
+            let mut n_seen = 0;
+            for step in 0..400 {
+                let radius = f64::from(step) * 0.005;
+                let plane = Vector2::new(radius * 0.6, radius * -0.8);
+                let Some(distorted) = brown_conrady(&k, plane) else { continue };
+                // Within a hair of the limit the inverse is not defined to 1e-12: its slope grows without bound.
+                if distorted.jacobian.determinant() < 1e-3 {
+                    continue;
+                }
+                n_seen += 1;
+                let back = undo_brown_conrady(&k, distorted.value).unwrap_or_else(|| panic!("{k:?} at {radius}"));
+                assert!((back - plane).norm() < 1e-11, "{k:?} at {radius}: off by {:e}", (back - plane).norm());
+            }
+            assert!(n_seen > 100, "{k:?}: only {n_seen} points inside the limit");
+        }
+    }
+}

@@ -1,0 +1,283 @@
+//! Resampling of a distorted image to the pinhole image of the same focal length and principal point.
+
+use crate::{Error, Intrinsics};
+
+/// For every pixel of the pinhole image, where it lies in the distorted image; made once per camera.
+///
+/// Input and output have the size of the camera. Positions follow this project's pixel centres at `(0.5, 0.5)`, so against
+/// OpenCV, whose centres are whole numbers, the principal point differs by half a pixel and the pixels are the same.
+#[derive(Clone, Debug)]
+pub struct Undistortion {
+    size_px: [u32; 2],
+    taps: Vec<Tap>,
+}
+
+/// Where one output pixel reads: the upper left of four neighbours, and the shares of the right and lower ones.
+#[derive(Clone, Copy, Debug)]
+struct Tap {
+    upper_left: u32,
+    right: u16,
+    lower: u16,
+}
+
+impl Tap {
+    /// The source lies outside the image.
+    const OUTSIDE: Self = Self { upper_left: u32::MAX, right: 0, lower: 0 };
+}
+
+/// One in the fixed point numbers of [`Tap`]. 11 bits twice and 8 bits of color fit 32.
+const ONE: u32 = 1 << SHARE_BITS;
+const SHARE_BITS: u32 = 11;
+
+impl Undistortion {
+    /// Computes the map for one camera. For a rectified or pinhole camera it is the identity.
+    pub fn new(intrinsics: &Intrinsics) -> Self {
+        let pinhole = intrinsics.undistorted();
+        let [width, height] = intrinsics.size_px;
+        let tap = |column: u32, row: u32| {
+            let ray = pinhole.unproject([f64::from(column) + 0.5, f64::from(row) + 0.5])?;
+            let source = intrinsics.project(&ray).filter(|source| intrinsics.contains(*source))?;
+            Some(tap_at(source, [width, height]))
+        };
+        let rows = (0..height).flat_map(|row| (0..width).map(move |column| (column, row)));
+        let taps = rows.map(|(column, row)| tap(column, row).unwrap_or(Tap::OUTSIDE)).collect();
+        Self { size_px: [width, height], taps }
+    }
+
+    /// Width and height of input and output, pixels.
+    pub fn size_px(&self) -> [u32; 2] {
+        self.size_px
+    }
+
+    /// How many output pixels the distorted image does not cover.
+    pub fn n_outside(&self) -> usize {
+        self.taps.iter().filter(|tap| tap.upper_left == u32::MAX).count()
+    }
+
+    /// Undistorts `[height, width, 3]` to `[height, width, 4]`, bilinear; alpha is 255, or 0 where the source was outside.
+    pub fn apply_rgb(&self, rgb: &[u8]) -> Result<Vec<u8>, Error> {
+        self.check_len(rgb.len(), 3)?;
+        Ok(self.resample::<3>(rgb))
+    }
+
+    /// Undistorts `[height, width, 4]`, bilinear in all four channels; all zero where the source was outside.
+    ///
+    /// Alpha is straight: a mask in it is interpolated like a color.
+    pub fn apply_rgba(&self, rgba: &[u8]) -> Result<Vec<u8>, Error> {
+        self.check_len(rgba.len(), 4)?;
+        Ok(self.resample::<4>(rgba))
+    }
+
+    /// Undistorts `[height, width]` of depth along the camera's z axis, which a lens does not change: the nearest source
+    /// pixel, because a mean across an edge is the depth of nothing; 0 where the source was outside.
+    pub fn apply_depth(&self, depth_m: &[f32]) -> Result<Vec<f32>, Error> {
+        self.check_len(depth_m.len(), 1)?;
+        let [step_right, step_down] = self.steps();
+        let nearest = |tap: &Tap| {
+            if tap.upper_left == u32::MAX {
+                return 0.0;
+            }
+            let right = if u32::from(tap.right) * 2 >= ONE { step_right } else { 0 };
+            let down = if u32::from(tap.lower) * 2 >= ONE { step_down } else { 0 };
+            depth_m[tap.upper_left as usize + right + down]
+        };
+        Ok(self.taps.iter().map(nearest).collect())
+    }
+
+    fn resample<const CHANNELS: usize>(&self, source: &[u8]) -> Vec<u8> {
+        let [step_right, step_down] = self.steps().map(|step| step * CHANNELS);
+        let mut rgba = vec![0; self.taps.len() * 4];
+        for (tap, out) in self.taps.iter().zip(rgba.as_chunks_mut::<4>().0) {
+            if tap.upper_left == u32::MAX {
+                continue;
+            }
+            let (right, lower) = (u32::from(tap.right), u32::from(tap.lower));
+            let (left, upper) = (ONE - right, ONE - lower);
+            let at = tap.upper_left as usize * CHANNELS;
+            let pair = |start: usize| {
+                let (a, b) = (&source[start..start + CHANNELS], &source[start + step_right..][..CHANNELS]);
+                std::array::from_fn::<u32, CHANNELS, _>(|c| u32::from(a[c]) * left + u32::from(b[c]) * right)
+            };
+            let (above, below) = (pair(at), pair(at + step_down));
+            out[3] = 255;
+            for channel in 0..CHANNELS {
+                let sum = above[channel] * upper + below[channel] * lower;
+                out[channel] = round_share(sum);
+            }
+        }
+        rgba
+    }
+
+    /// How far the right and the lower neighbour lie in the source; none in an image of one column or row.
+    fn steps(&self) -> [usize; 2] {
+        let [width, height] = self.size_px;
+        [usize::from(width > 1), if height > 1 { width as usize } else { 0 }]
+    }
+
+    fn check_len(&self, got: usize, channels: usize) -> Result<(), Error> {
+        let expected = self.taps.len() * channels;
+        let [width, height] = self.size_px;
+        if got == expected { Ok(()) } else { Err(Error::ImageSize { got, expected, width, height }) }
+    }
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "a mean of bytes is a byte")]
+fn round_share(sum: u32) -> u8 {
+    ((sum + (1 << (2 * SHARE_BITS - 1))) >> (2 * SHARE_BITS)) as u8
+}
+
+/// The tap for a source position inside the image; the outer half pixel takes the color of the border.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "positions lie in the image, shares in 0..=1"
+)]
+fn tap_at(source: [f64; 2], size_px: [u32; 2]) -> Tap {
+    let along = |axis: usize| {
+        let last = f64::from(size_px[axis] - 1);
+        let position = (source[axis] - 0.5).clamp(0.0, last);
+        // The last pixel is read as the right neighbour of the one before it, so that no read passes the end.
+        let start = position.floor().min((last - 1.0).max(0.0));
+        (start as u32, ((position - start) * f64::from(ONE)).round() as u16)
+    };
+    let ((column, right), (row, lower)) = (along(0), along(1));
+    Tap { upper_left: row * size_px[0] + column, right, lower }
+}
+
+#[cfg(test)]
+mod tests {
+    #![expect(clippy::cast_possible_truncation, reason = "test numbers lie well inside the integers' ranges")]
+
+    use super::*;
+    use crate::Lens;
+
+    fn camera(size_px: [u32; 2], lens: Lens) -> Intrinsics {
+        let [width, height] = size_px.map(f64::from);
+        Intrinsics {
+            size_px,
+            focal_px: [0.9 * width, 0.85 * width],
+            principal_px: [0.51 * width, 0.48 * height],
+            lens,
+            rectified: false,
+        }
+    }
+
+    fn noise(len: usize) -> Vec<u8> {
+        let mut state = 1_u32;
+        let mut next = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            state.to_be_bytes()[0]
+        };
+        (0..len).map(|_| next()).collect()
+    }
+
+    const BARREL: Lens = Lens::BrownConrady([-0.25, 0.05, 0.001, -0.002, 0.0]);
+    const CUSHION: Lens = Lens::BrownConrady([0.2, 0.03, -0.001, 0.001, 0.0]);
+
+    #[test]
+    fn a_pinhole_image_stays_as_it_is() {
+        let rgb = noise(40 * 30 * 3);
+        for intrinsics in [camera([40, 30], Lens::Pinhole), Intrinsics { rectified: true, ..camera([40, 30], CUSHION) }]
+        {
+            let out = Undistortion::new(&intrinsics).apply_rgb(&rgb).unwrap();
+            assert!(out.chunks(4).zip(rgb.chunks(3)).all(|(out, rgb)| out[..3] == *rgb && out[3] == 255));
+        }
+        let bent = Undistortion::new(&camera([40, 30], BARREL)).apply_rgb(&rgb).unwrap();
+        assert!(bent.chunks(4).zip(rgb.chunks(3)).any(|(out, rgb)| out[..3] != *rgb));
+    }
+
+    #[test]
+    fn straight_lines_of_the_world_become_straight() {
+        // A ramp over the world's x / z as the lens shows it must become a ramp over columns.
+        for lens in [BARREL, CUSHION, Lens::KannalaBrandt([0.02, -0.01, 0.0, 0.0])] {
+            let intrinsics = camera([160, 120], lens);
+            let ramp = |x_on_plane: f64| 128.0 + 150.0 * x_on_plane;
+            let mut rgb = Vec::new();
+            for (row, column) in (0..120).flat_map(|row| (0..160).map(move |column| (row, column))) {
+                let ray = intrinsics.unproject([f64::from(column) + 0.5, f64::from(row) + 0.5]).unwrap();
+                rgb.extend([ramp(ray.x).round().clamp(0.0, 255.0) as u8; 3]);
+            }
+            let map = Undistortion::new(&intrinsics);
+            let out = map.apply_rgb(&rgb).unwrap();
+            let mut n_compared = 0;
+            for (at, pixel) in out.chunks(4).enumerate().filter(|(_, pixel)| pixel[3] == 255) {
+                let ray = intrinsics.undistorted().unproject([(at % 160) as f64 + 0.5, 0.0]).unwrap();
+                let off = (f64::from(pixel[0]) - ramp(ray.x)).abs();
+                // Rounding to bytes twice; the outermost half pixel of the source repeats its border, up to half a step more.
+                assert!(off < 1.8, "{lens:?} at {at}: off by {off}");
+                n_compared += 1;
+            }
+            assert_eq!(n_compared, 160 * 120 - map.n_outside());
+            assert!(n_compared > 160 * 120 / 2);
+        }
+    }
+
+    #[test]
+    fn bilinear_weights_match_the_plain_formula() {
+        let size_px = [33, 21];
+        let intrinsics = camera(size_px, CUSHION);
+        let rgba = noise(33 * 21 * 4);
+        let out = Undistortion::new(&intrinsics).apply_rgba(&rgba).unwrap();
+        let value = |column: f64, row: f64, channel: usize| {
+            let (column, row) = (column.clamp(0.0, 32.0) as usize, row.clamp(0.0, 20.0) as usize);
+            f64::from(rgba[(row * 33 + column) * 4 + channel])
+        };
+        for at in 0..33 * 21 {
+            let (column, row) = ((at % 33) as f64 + 0.5, (at / 33) as f64 + 0.5);
+            let ray = intrinsics.undistorted().unproject([column, row]).unwrap();
+            let source = intrinsics.project(&ray).unwrap();
+            for channel in 0..4 {
+                let expected = if intrinsics.contains(source) {
+                    let (x, y) = (source[0] - 0.5, source[1] - 0.5);
+                    let (right, lower) = (x - x.floor(), y - y.floor());
+                    let mix = |row: f64| {
+                        (1.0 - right) * value(x.floor(), row, channel) + right * value(x.floor() + 1.0, row, channel)
+                    };
+                    (1.0 - lower) * mix(y.floor()) + lower * mix(y.floor() + 1.0)
+                } else {
+                    0.0
+                };
+                let off = (f64::from(out[at * 4 + channel]) - expected).abs();
+                assert!(off < 0.65, "pixel {at} channel {channel}: off by {off}"); // 0.5 rounding, 2 * 255 / 4096 shares.
+            }
+        }
+    }
+
+    #[test]
+    fn what_the_lens_did_not_see_is_transparent() {
+        let map = Undistortion::new(&camera([64, 48], CUSHION));
+        assert!(map.n_outside() > 0);
+        let out = map.apply_rgb(&vec![200; 64 * 48 * 3]).unwrap();
+        for pixel in out.chunks(4) {
+            assert!(pixel == [200, 200, 200, 255] || pixel == [0, 0, 0, 0], "{pixel:?}");
+        }
+        assert_eq!(out.chunks(4).filter(|pixel| pixel[3] == 0).count(), map.n_outside());
+        let depth = map.apply_depth(&[1.5; 64 * 48]).unwrap();
+        assert_eq!(depth.iter().filter(|depth| **depth == 0.0).count(), map.n_outside());
+    }
+
+    #[test]
+    fn depth_is_taken_from_the_pixel_that_holds_the_position() {
+        let intrinsics = camera([33, 21], BARREL);
+        let depth_m: Vec<f32> = (0..33 * 21).map(|at| at as f32).collect();
+        let out = Undistortion::new(&intrinsics).apply_depth(&depth_m).unwrap();
+        for (at, depth) in out.iter().enumerate() {
+            let ray = intrinsics.undistorted().unproject([(at % 33) as f64 + 0.5, (at / 33) as f64 + 0.5]).unwrap();
+            let [u, v] = intrinsics.project(&ray).unwrap();
+            assert_eq!(*depth as usize, v as usize * 33 + u as usize, "{at}");
+        }
+    }
+
+    #[test]
+    fn tiny_images_and_wrong_sizes_are_handled() {
+        for size_px in [[1, 1], [1, 7], [7, 1], [2, 2]] {
+            let n_pixels = (size_px[0] * size_px[1]) as usize;
+            let map = Undistortion::new(&camera(size_px, Lens::Pinhole));
+            let rgb = noise(n_pixels * 3);
+            let out = map.apply_rgb(&rgb).unwrap();
+            assert!(out.chunks(4).zip(rgb.chunks(3)).all(|(out, rgb)| out[..3] == *rgb), "{size_px:?}");
+            assert_eq!(map.apply_depth(&vec![2.0; n_pixels]).unwrap(), vec![2.0; n_pixels]);
+            assert!(matches!(map.apply_rgb(&rgb[1..]), Err(Error::ImageSize { .. })));
+        }
+    }
+}
