@@ -190,6 +190,37 @@ fn rolling_shutter_follows_the_camera_of_each_row() {
 }
 
 #[test]
+fn slopes_beyond_the_margin_are_clamped_in_the_covariance_alone() {
+    // A round splat 2 m away in a camera at the world's origin: its covariance follows from the slopes by hand.
+    let view = View { camera_from_world: Transform::identity(), ..tilted_view() };
+    let scale_px: [f64; 2] = [0.1 * 31.0 / 2.0, 0.1 * 28.0 / 2.0];
+    let splat = |mean| Splat {
+        mean,
+        log_scale: [0.1_f64.ln(); 3],
+        rotation_wxyz: [1.0, 0.0, 0.0, 0.0],
+        opacity_logit: 3.0,
+        sh: vec![[0.0; 3]],
+    };
+    // The margin is 0.15 of the image's side: to the right (28 - 13.3 + 4.2) / 31, upwards (10.4 + 3) / 28.
+    let (right, up) = (18.9 / 31.0, -13.4 / 28.0);
+    let mut wrong = Mismatches::default();
+    for (slope_x, slope_y) in [(right - 0.01, up + 0.01), (right + 0.2, up + 0.01), (right - 0.01, up - 0.2)] {
+        let placed = project(&view, &splat([2.0 * slope_x, 2.0 * slope_y, 2.0])).expect("it is in front of the camera");
+        let (clamped_x, clamped_y) = (slope_x.min(right), slope_y.max(up));
+        let cov_xx = scale_px[0].powi(2) * (1.0 + clamped_x * clamped_x) + 0.3;
+        let cov_yy = scale_px[1].powi(2) * (1.0 + clamped_y * clamped_y) + 0.3;
+        let cov_xy = scale_px[0] * scale_px[1] * clamped_x * clamped_y;
+        let determinant = cov_xx * cov_yy - cov_xy * cov_xy;
+        for (got, expected) in placed.conic.into_iter().zip([cov_yy, -cov_xy, cov_xx]) {
+            wrong.check(format!("conic at {slope_x} {slope_y}"), got, expected / determinant, 1e-12, 1e-12);
+        }
+        wrong.check("x", placed.mean_px[0], 31.0 * slope_x + 13.3, 1e-12, 1e-12);
+        wrong.check("y", placed.mean_px[1], 28.0 * slope_y + 10.4, 1e-12, 1e-12);
+    }
+    wrong.assert_none();
+}
+
+#[test]
 fn rows_beyond_the_image_are_read_with_its_first_or_last_row() {
     let view = rolling_view();
     let share_at = |x, y, z| {
