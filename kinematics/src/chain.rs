@@ -273,3 +273,196 @@ impl Fixed {
             Quaternion::new(r.w * cos - r.k * sin, r.i * cos + r.j * sin, r.j * cos - r.i * sin, r.k * cos + r.w * sin);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Matrix4;
+    use std::f64::consts::FRAC_PI_2;
+
+    const PANDA: &str = include_str!("../tests/data/panda.urdf");
+    const CLOSE: f64 = 1e-12; // Rounding of a dozen products of numbers near 1.
+
+    /// Modified Denavit-Hartenberg rows (a, d, alpha) of the Panda.
+    const PANDA_DH: [[f64; 3]; 7] = [
+        [0.0, 0.333, 0.0],
+        [0.0, 0.0, -FRAC_PI_2],
+        [0.0, 0.316, FRAC_PI_2],
+        [0.0825, 0.0, FRAC_PI_2],
+        [-0.0825, 0.384, -FRAC_PI_2],
+        [0.0, 0.0, FRAC_PI_2],
+        [0.088, 0.0, FRAC_PI_2],
+    ];
+
+    fn panda_by_dh(q: &[f64]) -> Matrix4<f64> {
+        let mut base_from_link = Matrix4::<f64>::identity();
+        for (&[a, d, alpha], theta) in PANDA_DH.iter().zip(q) {
+            let ((sa, ca), (st, ct)) = (alpha.sin_cos(), theta.sin_cos());
+            #[rustfmt::skip]
+            let step = Matrix4::new(
+                ct, -st, 0.0, a,
+                st * ca, ct * ca, -sa, -d * sa,
+                st * sa, ct * sa, ca, d * ca,
+                0.0, 0.0, 0.0, 1.0,
+            );
+            base_from_link *= step;
+        }
+        let flange = Matrix4::new_translation(&Vector3::new(0.0, 0.0, 0.107));
+        base_from_link * flange
+    }
+
+    fn configurations(n_joints: usize) -> Vec<Vec<f64>> {
+        let value = |at: usize, joint: usize| ((at * 7 + joint * 13 + 3) as f64 * 1.7).sin() * 2.5;
+        (0..50).map(|at| (0..n_joints).map(|joint| value(at, joint)).collect()).collect()
+    }
+
+    fn distance(a: &Matrix4<f64>, b: &Matrix4<f64>) -> f64 {
+        (a - b).abs().max()
+    }
+
+    /// Every kind of joint, odd axes and mimics with offsets, one of them following a joint off the path.
+    const ODD: &str = r#"<robot name="odd">
+        <link name="a"/><link name="b"/><link name="c"/><link name="d"/><link name="e"/><link name="f"/><link name="g"/>
+        <link name="off"/><link name="soft"/>
+        <joint name="down" type="continuous"><parent link="a"/><child link="b"/>
+            <origin xyz="0.1 0.2 0.3" rpy="0.4 -0.5 0.6"/><axis xyz="0 0 -2"/></joint>
+        <joint name="slide" type="prismatic"><parent link="b"/><child link="c"/>
+            <origin rpy="1 0 0"/><axis xyz="1 1 -1"/><limit lower="-1" upper="1" velocity="1"/></joint>
+        <joint name="rigid" type="fixed"><parent link="c"/><child link="d"/><origin xyz="0 0.3 0" rpy="0 0 2"/></joint>
+        <joint name="copy" type="revolute"><parent link="d"/><child link="e"/>
+            <axis xyz="0 1 0"/><mimic joint="down" multiplier="-2" offset="0.3"/></joint>
+        <joint name="far" type="revolute"><parent link="a"/><child link="off"/></joint>
+        <joint name="copy_far" type="prismatic"><parent link="e"/><child link="f"/>
+            <axis xyz="1 0 0"/><mimic joint="copy_copy" multiplier="0.5"/></joint>
+        <joint name="copy_copy" type="revolute"><parent link="f"/><child link="g"/>
+            <mimic joint="far" multiplier="3" offset="-1"/></joint>
+        <joint name="float" type="floating"><parent link="g"/><child link="soft"/></joint>
+    </robot>"#;
+
+    fn odd_by_hand(q: &[f64]) -> Matrix4<f64> {
+        let turn = |axis: Vector3<f64>, angle: f64| Matrix4::from_axis_angle(&Unit::new_normalize(axis), angle);
+        let shift = |vector: Vector3<f64>| Matrix4::new_translation(&vector);
+        let rpy = |r: f64, p: f64, y: f64| turn(Vector3::z(), y) * turn(Vector3::y(), p) * turn(Vector3::x(), r);
+        let third = 3.0 * q[2] - 1.0;
+        shift(Vector3::new(0.1, 0.2, 0.3))
+            * rpy(0.4, -0.5, 0.6)
+            * turn(-Vector3::z(), q[0])
+            * rpy(1.0, 0.0, 0.0)
+            * shift(Vector3::new(1.0, 1.0, -1.0).normalize() * q[1])
+            * shift(Vector3::new(0.0, 0.3, 0.0))
+            * rpy(0.0, 0.0, 2.0)
+            * turn(Vector3::y(), -2.0 * q[0] + 0.3)
+            * shift(Vector3::x() * 0.5 * third)
+            * turn(Vector3::x(), third)
+    }
+
+    #[test]
+    fn the_panda_agrees_with_its_published_numbers() {
+        let chain = Chain::from_urdf(PANDA, "link0", "link8").unwrap();
+        for q in configurations(7) {
+            assert!(distance(&chain.forward(&q).unwrap().to_homogeneous(), &panda_by_dh(&q)) < CLOSE);
+        }
+        let off = distance(&chain.forward(&[0.001; 7]).unwrap().to_homogeneous(), &panda_by_dh(&[0.0; 7]));
+        assert!(off > 1e-4, "the comparison must tell poses apart");
+    }
+
+    #[test]
+    fn every_kind_of_joint_agrees_with_a_product_by_hand() {
+        let chain = Chain::from_urdf(ODD, "a", "g").unwrap();
+        assert_eq!(chain.joint_names(), ["down", "slide", "far"]);
+        assert_eq!(chain.n_joints(), 3);
+        assert_eq!((chain.limits()[1].lower, chain.limits()[0].upper), (-1.0, f64::INFINITY));
+        for q in configurations(3) {
+            assert!(distance(&chain.forward(&q).unwrap().to_homogeneous(), &odd_by_hand(&q)) < CLOSE);
+        }
+    }
+
+    #[test]
+    fn a_chain_without_joints_is_a_constant() {
+        let chain = Chain::from_urdf(PANDA, "link7", "tcp").unwrap();
+        assert_eq!(chain.n_joints(), 0);
+        assert!((chain.forward(&[]).unwrap().translation.z - 0.2104).abs() < CLOSE);
+        assert_eq!(Chain::from_urdf(PANDA, "tcp", "tcp").unwrap().forward(&[]).unwrap(), Transform::identity());
+    }
+
+    #[test]
+    fn the_jacobian_matches_central_differences() {
+        const NUDGE: f64 = 1e-6;
+        const ABS: f64 = 1e-8; // Truncation NUDGE², rounding 1e-16 / NUDGE, each times sizes near 10.
+        for (urdf, base, tip) in [(PANDA, "link0", "tcp"), (PANDA, "link0", "finger_right"), (ODD, "a", "g")] {
+            let chain = Chain::from_urdf(urdf, base, tip).unwrap();
+            for q in configurations(chain.n_joints()) {
+                let jacobian = chain.jacobian(&q).unwrap();
+                let pose = chain.forward(&q).unwrap();
+                for joint in 0..chain.n_joints() {
+                    let nudged = |by: f64| {
+                        let mut q = q.clone();
+                        q[joint] += by;
+                        chain.forward(&q).unwrap()
+                    };
+                    let (ahead, behind) = (nudged(NUDGE), nudged(-NUDGE));
+                    let linear = (ahead.translation.vector - behind.translation.vector) / (2.0 * NUDGE);
+                    let angular = (ahead.rotation * behind.rotation.inverse()).scaled_axis() / (2.0 * NUDGE);
+                    assert!((jacobian.fixed_view::<3, 1>(0, joint) - linear).norm() < ABS, "{tip} joint {joint}");
+                    assert!((jacobian.fixed_view::<3, 1>(3, joint) - angular).norm() < ABS, "{tip} joint {joint}");
+                    // The same motion as a twist in the tip's own axes.
+                    let mut qd = vec![0.0; chain.n_joints()];
+                    qd[joint] = 1.0;
+                    let twist = chain.tip_twist(&q, &qd).unwrap();
+                    let moved = crate::transform::log(&(pose.inverse() * ahead), NUDGE);
+                    assert!((twist.linear_m_s - moved.linear_m_s).norm() < 1e-4, "{tip} joint {joint}");
+                    assert!((twist.angular_rad_s - moved.angular_rad_s).norm() < 1e-4, "{tip} joint {joint}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn forward_into_gives_the_same_bits_and_leaves_the_place_on_error() {
+        let chain = Chain::from_urdf(PANDA, "link0", "link8").unwrap();
+        let mut pose = Transform::identity();
+        chain.forward_into(&[0.3; 7], &mut pose).unwrap();
+        assert_eq!(pose, chain.forward(&[0.3; 7]).unwrap());
+        let kept = pose;
+        assert!(chain.forward_into(&[f64::NAN; 7], &mut pose).is_err());
+        assert_eq!(pose, kept);
+    }
+
+    #[test]
+    fn wrong_configurations_get_one_clear_sentence() {
+        let chain = Chain::from_urdf(PANDA, "link0", "link3").unwrap();
+        let told = |q: &[f64]| chain.forward(q).unwrap_err().to_string();
+        assert_eq!(told(&[0.0, 1.0]), "2 joint values given, the chain has 3: joint1, joint2, joint3");
+        assert_eq!(told(&[0.0, f64::NAN, 0.0]), r#"joint "joint2" is at NaN, not a finite number"#);
+        assert!(chain.jacobian(&[0.0; 4]).is_err() && chain.tip_twist(&[0.0; 3], &[f64::INFINITY; 3]).is_err());
+        let names = ["joint3", "x", "joint1", "joint2"].map(String::from);
+        assert_eq!(chain.order_in(&names), Ok(vec![2, 3, 0]));
+        assert_eq!(
+            chain.order_in(&names[..3]).unwrap_err().to_string(),
+            r#"joint "joint2" moves "link3" but is not among the joints given: joint3, x, joint1"#
+        );
+    }
+
+    #[test]
+    fn joints_that_cannot_be_computed_are_refused() {
+        let told = |urdf: &str, base: &str, tip: &str| Chain::from_urdf(urdf, base, tip).unwrap_err().to_string();
+        assert_eq!(
+            told(ODD, "a", "soft"),
+            r#"joint "float" is floating, only fixed, revolute, continuous and prismatic joints can be computed"#
+        );
+        let mimic = |from: &str, to: &str| told(&PANDA.replace(from, to), "link0", "finger_right");
+        let source = r#"mimic joint="finger_joint_left""#;
+        assert_eq!(
+            mimic(source, r#"mimic joint="thumb""#),
+            r#"joint "finger_joint_right" mimics "thumb", which is not in the URDF"#
+        );
+        assert_eq!(
+            mimic(source, r#"mimic joint="hand_tcp""#),
+            r#"joint "finger_joint_right" mimics "hand_tcp", which is not a moving joint of one number"#
+        );
+        assert_eq!(
+            mimic(source, r#"mimic joint="finger_joint_right""#),
+            r#"joint "finger_joint_right" mimics "finger_joint_right", which follows it in turn"#
+        );
+    }
+}

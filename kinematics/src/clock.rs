@@ -46,11 +46,11 @@ struct Line {
 /// Each bucket keeps one arrival.
 const BUCKET_NANOS: i64 = 250_000_000;
 /// Arrivals older than this are forgotten, so that the map follows a drift that changes with temperature.
-const WINDOW_SECS: f64 = 60.0;
+const WINDOW_SECS: f64 = 120.0;
 /// No crystal in use is further off; slopes beyond come from latency.
 const MAX_DRIFT: f64 = 200e-6;
 /// Drift is believed in proportion to the time seen, fully from here on: before, latency looks like drift.
-const FULL_DRIFT_SECS: f64 = 20.0;
+const FULL_DRIFT_SECS: f64 = 40.0;
 /// A device stamp further back than this is a new start of its clock; less is disorder on the wire.
 const MAX_DISORDER_NANOS: i64 = 500_000_000;
 /// An arrival this far before the line, seconds, cannot be: the device clock jumped ahead.
@@ -288,12 +288,19 @@ mod tests {
 
     #[test]
     fn jitter_and_drift_are_filtered_to_a_millisecond() {
-        const CLOSE_NANOS: i64 = 1_000_000;
+        // Rate, length of the run, time to settle, largest error in the rest of it. With few messages a quick one is rare:
+        // the quickest of the n seen late in a window is about 75 ms / n late.
+        const RUNS: [(f64, f64, f64, i64); 4] = [
+            (1000.0, 30.0, 2.0, 300_000),
+            (200.0, 60.0, 6.0, 700_000),
+            (60.0, 150.0, 10.0, 1_000_000),
+            (30.0, 150.0, 20.0, 1_500_000),
+        ];
         for seed in 1..=20 {
-            for (rate_hz, settled_secs) in [(1000.0, 2.0), (200.0, 6.0)] {
+            for (rate_hz, secs, settled_secs, close_nanos) in RUNS {
                 let mut clock = ClockMap::new();
-                let worst = worst_error(&mut clock, &mut Device::new(rate_hz, seed), 150.0, settled_secs);
-                assert!(worst < CLOSE_NANOS, "{rate_hz} Hz, seed {seed}: {} us off", worst / 1000);
+                let worst = worst_error(&mut clock, &mut Device::new(rate_hz, seed), secs, settled_secs);
+                assert!(worst < close_nanos, "{rate_hz} Hz, seed {seed}: {} us off", worst / 1000);
                 assert!((clock.drift() - DRIFT).abs() < 20e-6, "{rate_hz} Hz, seed {seed}: drift {}", clock.drift());
                 assert_eq!(clock.n_restarts(), 0);
             }

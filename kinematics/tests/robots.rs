@@ -1,0 +1,74 @@
+//! Forward kinematics against poses from an independent rigid-body library, for every robot of the test data.
+#![expect(clippy::unwrap_used, reason = "a test ends at what it did not expect")]
+
+use kinematics::Chain;
+use kinematics::urdf::Robot;
+use nalgebra::Matrix4;
+use serde_json::Value;
+use std::path::PathBuf;
+
+/// Metres, and rotation matrix elements: both sides round differently, by a few 1e-16 a joint.
+const CLOSE: f64 = 1e-12;
+
+fn robots() -> Option<PathBuf> {
+    let data = std::env::var("FIELDRIG_TEST_DATA")
+        .map_or_else(|_| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data")), PathBuf::from);
+    let robots = data.join("robots");
+    if robots.is_dir() {
+        return Some(robots);
+    }
+    eprintln!("skipped: no test data at {}", robots.display());
+    None
+}
+
+fn numbers(value: &Value) -> Vec<f64> {
+    value.as_array().unwrap().iter().map(|number| number.as_f64().unwrap()).collect()
+}
+
+fn words(value: &Value) -> Vec<String> {
+    value.as_array().unwrap().iter().map(|word| word.as_str().unwrap().to_owned()).collect()
+}
+
+#[test]
+fn poses_agree_with_the_independent_library() {
+    let Some(robots) = robots() else { return };
+    let mut n_poses = 0;
+    let mut worst_of_all: f64 = 0.0;
+    for entry in robots.read_dir().unwrap() {
+        let path = entry.unwrap().path();
+        if !path.file_name().unwrap().to_str().unwrap().starts_with("fk_") {
+            continue;
+        }
+        let oracle: Value = serde_json::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap();
+        let urdf = std::fs::read_to_string(robots.join(oracle["urdf"].as_str().unwrap())).unwrap();
+        let robot = Robot::parse(&urdf).unwrap();
+        let root = oracle["root"].as_str().unwrap();
+        assert_eq!(robot.root().unwrap(), root);
+        let names = words(&oracle["joint_names"]);
+        for frame in words(&oracle["frames"]) {
+            let chain = Chain::new(&robot, root, &frame).unwrap();
+            let order = chain.order_in(&names).unwrap();
+            let mut worst: f64 = 0.0;
+            for sample in oracle["samples"].as_array().unwrap() {
+                let all = numbers(&sample["q"]);
+                let q: Vec<f64> = order.iter().map(|&at| all[at]).collect();
+                let rows: Vec<f64> = sample["T"][&frame].as_array().unwrap().iter().flat_map(numbers).collect();
+                let pose = chain.forward(&q).unwrap().to_homogeneous();
+                worst = worst.max((pose - Matrix4::from_row_slice(&rows)).abs().max());
+                n_poses += 1;
+            }
+            eprintln!("{}: {frame}: largest difference {worst:.1e}", path.display());
+            worst_of_all = worst_of_all.max(worst);
+        }
+    }
+    assert!(n_poses >= 1000, "only {n_poses} poses compared");
+    assert!(worst_of_all < CLOSE, "largest difference {worst_of_all:e}");
+}
+
+#[test]
+fn the_file_without_a_robot_is_refused_in_one_sentence() {
+    let Some(robots) = robots() else { return };
+    let urdf = std::fs::read_to_string(robots.join("invalid_ur3.urdf")).unwrap();
+    let message = Chain::from_urdf(&urdf, "base_link", "tool0").unwrap_err().to_string();
+    assert_eq!(message, r#"urdf: robot "" has no <link> (an export that failed or was never expanded from xacro?)"#);
+}
