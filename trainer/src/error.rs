@@ -1,5 +1,7 @@
 //! What can go wrong in training.
 
+use std::path::PathBuf;
+
 /// Errors of the trainer.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -7,4 +9,79 @@ pub enum Error {
     /// No GPU, real or software, answers.
     #[error("no GPU adapter found: install a Vulkan driver (software: the package mesa-vulkan-drivers)")]
     NoAdapter,
+    /// A picture does not hold four bytes a pixel.
+    #[error("{what} picture of {width}x{height} pixels: got {got} bytes, expected {expected}")]
+    PictureBytes {
+        /// Which of the two.
+        what: &'static str,
+        /// Width, pixels.
+        width: u32,
+        /// Height, pixels.
+        height: u32,
+        /// Bytes it holds.
+        got: usize,
+        /// Bytes it should hold.
+        expected: usize,
+    },
+    /// A metric needs larger pictures.
+    #[error("{metric} needs pictures of at least {least_px}x{least_px} pixels, got {width}x{height}")]
+    PictureTooSmall {
+        /// The metric.
+        metric: &'static str,
+        /// Shortest side it takes, pixels.
+        least_px: u32,
+        /// Width, pixels.
+        width: u32,
+        /// Height, pixels.
+        height: u32,
+    },
+    /// Every pixel, or every window, is masked.
+    #[error("nothing to compare: the mask leaves no pixel")]
+    NothingSeen,
+    /// Two depth images differ in size.
+    #[error("rendered depth has {rendered} pixels, true depth {truth}")]
+    DepthSize {
+        /// Pixels of the rendered one.
+        rendered: usize,
+        /// Pixels of the true one.
+        truth: usize,
+    },
+    /// A file cannot be read.
+    #[error("cannot read {path:?}")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// A file cannot be written.
+    #[error("cannot write {path:?}")]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// A file does not hold the weights of LPIPS.
+    #[error("{path:?} does not hold LPIPS weights for SqueezeNet: {source}")]
+    LpipsWeights {
+        /// The file.
+        path: PathBuf,
+        /// What is missing or wrong.
+        source: candle_core::Error,
+    },
+    /// The network of LPIPS failed.
+    #[error("LPIPS network failed")]
+    LpipsNetwork(#[source] candle_core::Error),
+    /// A file of splats is not what it should be.
+    #[error("{path:?} is not a splat file we read: {reason}")]
+    SplatFile {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// Arrays of splats do not fit together.
+    #[error("splats: {0}")]
+    SplatArrays(String),
 }

@@ -1,12 +1,14 @@
 //! Radiance fields trained on wgpu: keyframes in, pictures out.
 
 mod error;
+pub mod eval;
 pub mod keyframe;
 pub mod loss;
 pub mod method;
 #[cfg(test)]
 mod mismatches;
 pub mod optim;
+pub mod ply;
 pub mod request;
 pub mod splat;
 

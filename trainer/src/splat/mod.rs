@@ -1,3 +1,5 @@
 //! Scenes of 3D Gaussians.
 
+pub mod arrays;
+pub mod cloud;
 pub mod reference;

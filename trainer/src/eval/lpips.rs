@@ -1,0 +1,186 @@
+//! LPIPS, the learned perceptual distance, on SqueezeNet 1.1 (version 0.1 of the weights).
+
+use super::PixelPair;
+use crate::Error;
+use candle_core::{Device, Tensor};
+use std::collections::HashMap;
+use std::path::Path;
+
+/// Shortest side, pixels: the weights were fitted to patches of this size.
+const LEAST_SIDE_PX: u32 = 64;
+/// Channel means and deviations of the inputs, which lie in -1 to 1.
+const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
+const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
+/// Keeps the normalisation of an all-zero feature finite.
+const EPSILON: f64 = 1e-10;
+/// The parts of the network, each ending where features are compared. `true`: halve the size before the fire module.
+const STAGES: [&[(usize, bool)]; 6] =
+    [&[(3, true), (4, false)], &[(6, true), (7, false)], &[(9, true)], &[(10, false)], &[(11, false)], &[(12, false)]];
+
+/// The learned perceptual distance of two pictures; 0 for equal ones.
+///
+/// Features of seven depths of SqueezeNet 1.1, normalised per pixel, squared differences weighted per channel, mean over
+/// pixels, sum over depths. Source: Zhang, Isola, Efros, Shechtman, Wang 2018, section 3; Iandola et al. 2016.
+#[derive(Debug)]
+pub struct Lpips {
+    first: Convolution,
+    stages: Vec<Vec<Fire>>,
+    /// Weights of the channels at each depth, `[1, n_channels, 1, 1]`.
+    channel_weights: Vec<Tensor>,
+}
+
+impl Lpips {
+    /// Reads the weights: a safetensors file with `features.*` of SqueezeNet 1.1 and `lin0..6.weight`.
+    pub fn load(path: &Path) -> Result<Self, Error> {
+        let bytes = std::fs::read(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
+        Self::from_bytes(&bytes).map_err(|source| Error::LpipsWeights { path: path.to_owned(), source })
+    }
+
+    fn from_bytes(bytes: &[u8]) -> candle_core::Result<Self> {
+        let tensors = candle_core::safetensors::load_buffer(bytes, &Device::Cpu)?;
+        let stages = STAGES
+            .iter()
+            .map(|fires| fires.iter().map(|&(ix, halve)| Fire::of(&tensors, ix, halve)).collect())
+            .collect::<candle_core::Result<_>>()?;
+        let channel_weights = (0..=STAGES.len())
+            .map(|depth| named(&tensors, &format!("lin{depth}.weight"))?.reshape((1, (), 1, 1)))
+            .collect::<candle_core::Result<_>>()?;
+        Ok(Self { first: Convolution::of(&tensors, "features.0")?, stages, channel_weights })
+    }
+
+    /// The distance of the two pictures; masked pixels are mid grey in both.
+    ///
+    /// Fails for pictures with a side below 64 pixels, and when no pixel was seen.
+    pub fn distance(&self, pair: &PixelPair<'_>) -> Result<f64, Error> {
+        pair.require_side("LPIPS", LEAST_SIDE_PX)?;
+        if !(0..pair.truth_rgba.len() / 4).any(|ix| pair.is_seen(ix)) {
+            return Err(Error::NothingSeen);
+        }
+        self.distance_in_network(pair).map_err(Error::LpipsNetwork)
+    }
+
+    fn distance_in_network(&self, pair: &PixelPair<'_>) -> candle_core::Result<f64> {
+        let mut rendered = self.first.forward(&network_input(pair, pair.rendered_rgba)?, 0, 2)?;
+        let mut truth = self.first.forward(&network_input(pair, pair.truth_rgba)?, 0, 2)?;
+        let mut total = feature_distance(&rendered, &truth, &self.channel_weights[0])?;
+        for (stage, weights) in self.stages.iter().zip(&self.channel_weights[1..]) {
+            for fire in stage {
+                rendered = fire.forward(&rendered)?;
+                truth = fire.forward(&truth)?;
+            }
+            total += feature_distance(&rendered, &truth, weights)?;
+        }
+        Ok(total)
+    }
+}
+
+/// `[1, 3, height, width]`: -1 to 1, then shifted and scaled as the network expects.
+fn network_input(pair: &PixelPair<'_>, rgba: &[u8]) -> candle_core::Result<Tensor> {
+    let n_pixels = rgba.len() / 4;
+    let mut planes = Vec::with_capacity(3 * n_pixels);
+    for color in 0..3 {
+        planes.extend((0..n_pixels).map(|ix| {
+            let value = if pair.is_seen(ix) { f32::from(rgba[4 * ix + color]) / 127.5 - 1.0 } else { 0.0 };
+            (value - SHIFT[color]) / SCALE[color]
+        }));
+    }
+    let [width, height] = pair.size_px.map(|side| side as usize);
+    Tensor::from_vec(planes, (1, 3, height, width), &Device::Cpu)
+}
+
+/// Squared difference of features normalised per pixel, weighted per channel, mean over pixels.
+fn feature_distance(rendered: &Tensor, truth: &Tensor, channel_weights: &Tensor) -> candle_core::Result<f64> {
+    let difference = (normalized(rendered)? - normalized(truth)?)?;
+    let per_pixel =
+        difference.sqr()?.broadcast_mul(channel_weights)?.sum_keepdim(1)?.flatten_all()?.to_vec1::<f32>()?;
+    Ok(per_pixel.iter().copied().map(f64::from).sum::<f64>() / per_pixel.len() as f64)
+}
+
+fn normalized(feature: &Tensor) -> candle_core::Result<Tensor> {
+    feature.broadcast_div(&(feature.sqr()?.sum_keepdim(1)?.sqrt()? + EPSILON)?)
+}
+
+/// A convolution with bias and rectification.
+#[derive(Debug)]
+struct Convolution {
+    weight: Tensor,
+    /// `[1, n_channels, 1, 1]`.
+    bias: Tensor,
+}
+
+impl Convolution {
+    fn of(tensors: &HashMap<String, Tensor>, name: &str) -> candle_core::Result<Self> {
+        let weight = named(tensors, &format!("{name}.weight"))?;
+        let bias = named(tensors, &format!("{name}.bias"))?.reshape((1, (), 1, 1))?;
+        Ok(Self { weight, bias })
+    }
+
+    fn forward(&self, input: &Tensor, padding: usize, stride: usize) -> candle_core::Result<Tensor> {
+        input.conv2d(&self.weight, padding, stride, 1, 1)?.broadcast_add(&self.bias)?.relu()
+    }
+}
+
+/// SqueezeNet's module: few channels in the middle, then small and large windows side by side.
+#[derive(Debug)]
+struct Fire {
+    halve: bool,
+    squeeze: Convolution,
+    expand_1x1: Convolution,
+    expand_3x3: Convolution,
+}
+
+impl Fire {
+    fn of(tensors: &HashMap<String, Tensor>, ix: usize, halve: bool) -> candle_core::Result<Self> {
+        let part = |name: &str| Convolution::of(tensors, &format!("features.{ix}.{name}"));
+        Ok(Self { halve, squeeze: part("squeeze")?, expand_1x1: part("expand1x1")?, expand_3x3: part("expand3x3")? })
+    }
+
+    fn forward(&self, input: &Tensor) -> candle_core::Result<Tensor> {
+        let input = if self.halve { halved(input)? } else { input.clone() };
+        let squeezed = self.squeeze.forward(&input, 0, 1)?;
+        Tensor::cat(&[self.expand_1x1.forward(&squeezed, 0, 1)?, self.expand_3x3.forward(&squeezed, 1, 1)?], 1)
+    }
+}
+
+/// The largest of each 3 x 3 window, every second pixel, the last window reaching past the edge where sizes are even.
+///
+/// Features are rectified, so the zeros that fill such a window change no maximum.
+fn halved(feature: &Tensor) -> candle_core::Result<Tensor> {
+    let (_, _, height, width) = feature.dims4()?;
+    let past_edge = |side: usize| 1 - side % 2;
+    let padded = feature.pad_with_zeros(2, 0, past_edge(height))?.pad_with_zeros(3, 0, past_edge(width))?;
+    padded.max_pool2d_with_stride(3, 2)
+}
+
+fn named(tensors: &HashMap<String, Tensor>, name: &str) -> candle_core::Result<Tensor> {
+    let found = tensors.get(name).cloned();
+    found.ok_or_else(|| candle_core::Error::Msg(format!("no tensor {name:?}")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pooling_of_an_even_side_reaches_past_the_edge() {
+        let feature = Tensor::arange(0_f32, 16.0, &Device::Cpu).unwrap().reshape((1, 1, 4, 4)).unwrap();
+        let pooled = halved(&feature).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        assert_eq!(pooled, [10.0, 11.0, 14.0, 15.0]);
+    }
+
+    #[test]
+    fn files_without_weights_are_refused_by_name() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("weights.safetensors");
+        assert!(matches!(Lpips::load(&path), Err(Error::Read { .. })));
+        std::fs::write(&path, b"not weights").unwrap();
+        let error = Lpips::load(&path).unwrap_err();
+        assert!(error.to_string().contains("weights.safetensors"), "{error}");
+        let empty = HashMap::from([(
+            "lin0.weight".to_owned(),
+            Tensor::zeros(64, candle_core::DType::F32, &Device::Cpu).unwrap(),
+        )]);
+        candle_core::safetensors::save(&empty, &path).unwrap();
+        assert!(Lpips::load(&path).unwrap_err().to_string().contains("features.3.squeeze.weight"));
+    }
+}

@@ -1,0 +1,54 @@
+//! How near a rendered picture comes to the truth: PSNR, SSIM, LPIPS and depth error.
+
+mod depth;
+mod lpips;
+mod psnr;
+mod ssim;
+
+pub use depth::depth_rmse_m;
+pub use lpips::Lpips;
+pub use psnr::psnr;
+pub use ssim::ssim;
+
+use crate::Error;
+
+/// Two pictures of one size to be compared, `[height, width, 4]`, 8-bit sRGB.
+///
+/// Only pixels that were seen count: those where the truth's alpha is not 0. The rendered picture's alpha means nothing.
+#[derive(Clone, Copy, Debug)]
+pub struct PixelPair<'a> {
+    size_px: [u32; 2],
+    rendered_rgba: &'a [u8],
+    truth_rgba: &'a [u8],
+}
+
+impl<'a> PixelPair<'a> {
+    /// Pairs two pictures; fails when either does not hold width x height x 4 bytes.
+    pub fn new(size_px: [u32; 2], rendered_rgba: &'a [u8], truth_rgba: &'a [u8]) -> Result<Self, Error> {
+        let expected = size_px[0] as usize * size_px[1] as usize * 4;
+        for (what, bytes) in [("rendered", rendered_rgba), ("true", truth_rgba)] {
+            if bytes.len() != expected {
+                let [width, height] = size_px;
+                return Err(Error::PictureBytes { what, width, height, got: bytes.len(), expected });
+            }
+        }
+        Ok(Self { size_px, rendered_rgba, truth_rgba })
+    }
+
+    /// Fails when a side is shorter than `least_px`, which `metric` needs.
+    fn require_side(&self, metric: &'static str, least_px: u32) -> Result<(), Error> {
+        let [width, height] = self.size_px;
+        if width < least_px || height < least_px {
+            return Err(Error::PictureTooSmall { metric, least_px, width, height });
+        }
+        Ok(())
+    }
+
+    /// Whether the truth was seen at this pixel.
+    fn is_seen(&self, pixel_ix: usize) -> bool {
+        self.truth_rgba[4 * pixel_ix + 3] != 0
+    }
+}
+
+#[cfg(test)]
+mod oracle;

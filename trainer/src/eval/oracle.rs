@@ -1,0 +1,108 @@
+//! Our metrics against independent libraries on the shared picture pairs.
+
+use super::{Lpips, PixelPair, psnr, ssim};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+
+/// Both sides compute the same integers.
+const PSNR_TOLERANCE_DB: f64 = 1e-6;
+/// Ours blurs in f32; the reference in f64 agrees to a few 1e-6.
+const SSIM_TOLERANCE: f64 = 1e-4;
+/// Different summation order through 26 convolutions in f32.
+const LPIPS_TOLERANCE: f64 = 1e-4;
+
+fn metrics_folder() -> Option<PathBuf> {
+    let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
+    let folder = std::env::var_os("FIELDRIG_TEST_DATA").map_or_else(beside, PathBuf::from).join("metrics");
+    if !folder.is_dir() {
+        eprintln!("skipped: no test data at {}", folder.display());
+        return None;
+    }
+    Some(folder)
+}
+
+struct Picture {
+    size_px: [u32; 2],
+    rgba: Vec<u8>,
+}
+
+/// The picture of this base name.
+fn picture(folder: &Path, name: &str) -> Picture {
+    let base = Path::new(name).file_name().unwrap();
+    let image = image::open(folder.join(base)).unwrap().into_rgba8();
+    Picture { size_px: [image.width(), image.height()], rgba: image.into_raw() }
+}
+
+fn json(path: &Path) -> Value {
+    serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
+}
+
+/// Whether the figure agrees; prints it where it does not.
+fn agrees(what: &str, got: f64, expected: f64, tolerance: f64) -> bool {
+    let good = (got - expected).abs() <= tolerance;
+    if !good {
+        eprintln!("{what}: got {got}, expected {expected}");
+    }
+    good
+}
+
+#[test]
+fn metrics_agree_with_the_oracle() {
+    let Some(folder) = metrics_folder() else { return };
+    let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
+    let rows = json(&folder.join("oracle_metrics.json"));
+    let mut good = true;
+    for row in rows.as_array().unwrap() {
+        let (a, b) = (row["a"].as_str().unwrap(), row["b"].as_str().unwrap());
+        let (first, second) = (picture(&folder, a), picture(&folder, b));
+        let pair = PixelPair::new(first.size_px, &first.rgba, &second.rgba).unwrap();
+        let expected = |column: &str| row[column].as_f64().unwrap();
+        good &= agrees(b, psnr(&pair).unwrap(), expected("psnr_skimage_255"), PSNR_TOLERANCE_DB);
+        good &= agrees(b, ssim(&pair).unwrap(), expected("ssim_3dgs_valid_crop5"), SSIM_TOLERANCE);
+        good &= agrees(b, lpips.distance(&pair).unwrap(), expected("lpips_squeeze_v0.1"), LPIPS_TOLERANCE);
+    }
+    assert!(good, "see the figures above");
+    assert_eq!(rows.as_array().unwrap().len(), 3);
+}
+
+#[test]
+fn lpips_agrees_pair_by_pair_and_is_zero_for_equal_pictures() {
+    let Some(folder) = metrics_folder() else { return };
+    let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
+    for (names, row) in json(&folder.join("oracle_lpips_squeeze_ex.json")).as_object().unwrap() {
+        let (a, b) = names.split_once('|').unwrap();
+        let (first, second) = (picture(&folder, a), picture(&folder, b));
+        let pair = PixelPair::new(first.size_px, &first.rgba, &second.rgba).unwrap();
+        let expected = row["lpips_squeeze_v0.1"].as_f64().unwrap();
+        assert!(agrees(names, lpips.distance(&pair).unwrap(), expected, LPIPS_TOLERANCE));
+    }
+}
+
+#[test]
+fn a_slightly_wrong_picture_does_not_agree() {
+    let Some(folder) = metrics_folder() else { return };
+    let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
+    let (a, b) = (picture(&folder, "fox_a.png"), picture(&folder, "fox_b_noise.png"));
+    // One level brighter everywhere: hardly visible, yet every metric must notice.
+    let brighter: Vec<u8> = b.rgba.iter().map(|&value| value.saturating_add(1)).collect();
+    let right = PixelPair::new(a.size_px, &a.rgba, &b.rgba).unwrap();
+    let wrong = PixelPair::new(a.size_px, &a.rgba, &brighter).unwrap();
+    assert!(!agrees("psnr", psnr(&wrong).unwrap(), psnr(&right).unwrap(), PSNR_TOLERANCE_DB));
+    assert!(!agrees("ssim", ssim(&wrong).unwrap(), ssim(&right).unwrap(), SSIM_TOLERANCE));
+    let (got, expected) = (lpips.distance(&wrong).unwrap(), lpips.distance(&right).unwrap());
+    assert!(!agrees("lpips", got, expected, LPIPS_TOLERANCE));
+}
+
+#[test]
+fn lpips_leaves_masked_pixels_out_and_refuses_small_pictures() {
+    let Some(folder) = metrics_folder() else { return };
+    let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
+    let (a, mut b) = (picture(&folder, "fox_a.png"), picture(&folder, "fox_a.png"));
+    for pixel in b.rgba.chunks_exact_mut(4).take(5000) {
+        pixel.copy_from_slice(&[255, 0, 255, 0]);
+    }
+    assert_eq!(lpips.distance(&PixelPair::new(a.size_px, &a.rgba, &b.rgba).unwrap()).unwrap(), 0.0);
+    let small = vec![255; 63 * 80 * 4];
+    let error = lpips.distance(&PixelPair::new([63, 80], &small, &small).unwrap()).unwrap_err();
+    assert_eq!(error.to_string(), "LPIPS needs pictures of at least 64x64 pixels, got 63x80");
+}

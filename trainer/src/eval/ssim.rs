@@ -1,0 +1,217 @@
+//! Structural similarity, gaussian window of 11 pixels, sigma 1.5, valid crop.
+
+use super::PixelPair;
+use crate::Error;
+use rayon::prelude::*;
+
+/// Side of the window, pixels.
+const WINDOW: usize = 11;
+const SIGMA_PX: f64 = 1.5;
+const C1: f32 = 0.01 * 0.01;
+const C2: f32 = 0.03 * 0.03;
+
+/// Structural similarity, the mean over the three colours and over all windows that lie inside the picture.
+///
+/// Windows that touch a masked pixel are left out. Source: Wang, Bovik, Sheikh, Simoncelli 2004, section III.
+/// Fails for pictures smaller than a window, and when no window is left.
+pub fn ssim(pair: &PixelPair<'_>) -> Result<f64, Error> {
+    pair.require_side("SSIM", WINDOW as u32)?;
+    let width = pair.size_px[0] as usize;
+    let n_rows = pair.size_px[1] as usize - WINDOW + 1;
+    let signal = SumAndDifference::of(pair);
+    let unseen = unseen_counts(pair);
+    // Each row's sum is kept apart and added in order, so the result does not depend on the threads.
+    let rows: Vec<(f64, usize)> = (0..n_rows)
+        .into_par_iter()
+        .map_init(|| RowScratch::new(width), |scratch, y| scratch.ssim_of_row(&signal, unseen.as_deref(), y))
+        .collect();
+    let n_windows: usize = rows.iter().map(|row| row.1).sum();
+    if n_windows == 0 {
+        return Err(Error::NothingSeen);
+    }
+    Ok(rows.iter().map(|row| row.0).sum::<f64>() / (3 * n_windows) as f64)
+}
+
+/// `rendered + truth` and `rendered - truth`, colours interleaved, each picture in 0 to 1.
+///
+/// The local variances of these two hold all that SSIM needs: their sum is twice the sum of the pictures' variances,
+/// their difference four times the covariance. That is four blurs instead of five.
+struct SumAndDifference {
+    row_len: usize,
+    sum: Vec<f32>,
+    difference: Vec<f32>,
+}
+
+impl SumAndDifference {
+    fn of(pair: &PixelPair<'_>) -> Self {
+        let n_pixels = pair.truth_rgba.len() / 4;
+        let (mut sum, mut difference) = (Vec::with_capacity(3 * n_pixels), Vec::with_capacity(3 * n_pixels));
+        for (rendered, truth) in pair.rendered_rgba.chunks_exact(4).zip(pair.truth_rgba.chunks_exact(4)) {
+            for color in 0..3 {
+                let (rendered, truth) = (f32::from(rendered[color]) / 255.0, f32::from(truth[color]) / 255.0);
+                sum.push(rendered + truth);
+                difference.push(rendered - truth);
+            }
+        }
+        Self { row_len: 3 * pair.size_px[0] as usize, sum, difference }
+    }
+}
+
+/// For every column of every window row, how many of its 11 pixels are masked; none when no pixel is.
+fn unseen_counts(pair: &PixelPair<'_>) -> Option<Vec<u8>> {
+    let [width, height] = pair.size_px.map(|side| side as usize);
+    if (0..width * height).all(|ix| pair.is_seen(ix)) {
+        return None;
+    }
+    let unseen = |x: usize, y: usize| u8::from(!pair.is_seen(y * width + x));
+    let mut counts = vec![0; width * (height - WINDOW + 1)];
+    for x in 0..width {
+        let mut count: u8 = (0..WINDOW).map(|y| unseen(x, y)).sum();
+        counts[x] = count;
+        for y in 1..=height - WINDOW {
+            count = count + unseen(x, y + WINDOW - 1) - unseen(x, y - 1);
+            counts[y * width + x] = count;
+        }
+    }
+    Some(counts)
+}
+
+/// Memory for one row of windows: the four signals blurred along y, then along x.
+struct RowScratch {
+    weights: [f32; WINDOW],
+    width: usize,
+    blurred_y: [Vec<f32>; 4],
+    blurred: [Vec<f32>; 4],
+}
+
+impl RowScratch {
+    fn new(width: usize) -> Self {
+        let inside = 3 * (width - WINDOW + 1);
+        Self {
+            weights: gaussian(),
+            width,
+            blurred_y: std::array::from_fn(|_| vec![0.0; 3 * width]),
+            blurred: std::array::from_fn(|_| vec![0.0; inside]),
+        }
+    }
+
+    /// The sum of SSIM over the windows whose first row is `y` and the three colours, and the number of windows.
+    fn ssim_of_row(&mut self, signal: &SumAndDifference, unseen: Option<&[u8]>, y: usize) -> (f64, usize) {
+        self.blur_along_y(signal, y);
+        self.blur_along_x();
+        let n_columns = self.width - WINDOW + 1;
+        let unseen_row = unseen.map(|counts| &counts[y * self.width..(y + 1) * self.width]);
+        let (mut total, mut n_windows) = (0.0, 0);
+        for x in 0..n_columns {
+            if unseen_row.is_some_and(|row| row[x..x + WINDOW].iter().any(|&count| count > 0)) {
+                continue;
+            }
+            n_windows += 1;
+            total += (3 * x..3 * x + 3).map(|ix| f64::from(self.ssim_at(ix))).sum::<f64>();
+        }
+        (total, n_windows)
+    }
+
+    fn blur_along_y(&mut self, signal: &SumAndDifference, y: usize) {
+        for blurred in &mut self.blurred_y {
+            blurred.fill(0.0);
+        }
+        let [sum, difference, sum_square, difference_square] = &mut self.blurred_y;
+        for (offset, &weight) in self.weights.iter().enumerate() {
+            let row = (y + offset) * signal.row_len..(y + offset + 1) * signal.row_len;
+            add_weighted(sum, sum_square, &signal.sum[row.clone()], weight);
+            add_weighted(difference, difference_square, &signal.difference[row], weight);
+        }
+    }
+
+    fn blur_along_x(&mut self) {
+        for (blurred, blurred_y) in self.blurred.iter_mut().zip(&self.blurred_y) {
+            blurred.fill(0.0);
+            for (offset, &weight) in self.weights.iter().enumerate() {
+                for (out, value) in blurred.iter_mut().zip(&blurred_y[3 * offset..]) {
+                    *out += weight * value;
+                }
+            }
+        }
+    }
+
+    /// SSIM of one colour of one window.
+    fn ssim_at(&self, ix: usize) -> f32 {
+        let [sum, difference, sum_square, difference_square] = self.blurred.each_ref().map(|blurred| blurred[ix]);
+        let (sum_variance, difference_variance) = (sum_square - sum * sum, difference_square - difference * difference);
+        let twice_product = (sum * sum - difference * difference) / 2.0;
+        let squares = (sum * sum + difference * difference) / 2.0;
+        let twice_covariance = (sum_variance - difference_variance) / 2.0;
+        let variances = (sum_variance + difference_variance) / 2.0;
+        ((twice_product + C1) * (twice_covariance + C2)) / ((squares + C1) * (variances + C2))
+    }
+}
+
+/// Adds a row and its squares, weighted.
+fn add_weighted(blurred: &mut [f32], blurred_square: &mut [f32], row: &[f32], weight: f32) {
+    for ((blurred, square), &value) in blurred.iter_mut().zip(blurred_square).zip(row) {
+        *blurred += weight * value;
+        *square += weight * value * value;
+    }
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "weights between 0 and 1")]
+fn gaussian() -> [f32; WINDOW] {
+    let half = (WINDOW / 2) as f64;
+    let raw: [f64; WINDOW] = std::array::from_fn(|ix| (-((ix as f64 - half) / SIGMA_PX).powi(2) / 2.0).exp());
+    let total: f64 = raw.iter().sum();
+    raw.map(|weight| (weight / total) as f32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A picture of repeatable noise.
+    fn noise(n_pixels: usize, seed: u32) -> Vec<u8> {
+        let mut state = seed;
+        let mut next = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            state.to_le_bytes()[3]
+        };
+        (0..n_pixels).flat_map(|_| [next(), next(), next(), 255]).collect()
+    }
+
+    #[test]
+    fn equal_pictures_give_one_and_unrelated_ones_almost_zero() {
+        let (a, b) = (noise(40 * 30, 1), noise(40 * 30, 2));
+        let same = ssim(&PixelPair::new([40, 30], &a, &a).unwrap()).unwrap();
+        assert!((same - 1.0).abs() < 1e-6, "{same}");
+        let unrelated = ssim(&PixelPair::new([40, 30], &a, &b).unwrap()).unwrap();
+        assert!(unrelated.abs() < 0.1, "{unrelated}");
+    }
+
+    #[test]
+    fn a_masked_pixel_takes_out_exactly_the_windows_it_touches() {
+        let a = noise(40 * 30, 1);
+        let mut rendered = a.clone();
+        let mut truth = a.clone();
+        // Wrong only where masked: what is left is perfect.
+        let pixel = 4 * (15 * 40 + 20);
+        rendered[pixel] ^= 0xff;
+        truth[pixel + 3] = 0;
+        let masked = ssim(&PixelPair::new([40, 30], &rendered, &truth).unwrap()).unwrap();
+        assert!((masked - 1.0).abs() < 1e-6, "{masked}");
+        let counted = ssim(&PixelPair::new([40, 30], &rendered, &a).unwrap()).unwrap();
+        assert!(counted < 0.999, "{counted}");
+        // A wrong pixel just outside the mask still counts.
+        rendered[pixel + 4] ^= 0xff;
+        let beside = ssim(&PixelPair::new([40, 30], &rendered, &truth).unwrap()).unwrap();
+        assert!(beside < 0.999_99, "{beside}");
+    }
+
+    #[test]
+    fn small_and_wholly_masked_pictures_are_refused() {
+        let a = noise(10 * 30, 1);
+        let pair = PixelPair::new([10, 30], &a, &a).unwrap();
+        assert!(matches!(ssim(&pair), Err(Error::PictureTooSmall { least_px: 11, width: 10, .. })));
+        let mut masked = noise(11 * 11, 1);
+        masked[3] = 0;
+        assert!(matches!(ssim(&PixelPair::new([11, 11], &masked, &masked).unwrap()), Err(Error::NothingSeen)));
+    }
+}

@@ -1,0 +1,154 @@
+//! The packed `.ply` of SuperSplat: 16 bytes a splat in chunks of 256 with common bounds, colour beyond the constant 8 bits.
+
+use super::header::{Column, Header, Table};
+use super::rest_columns;
+use crate::splat::arrays::SplatArrays;
+
+const SPLATS_A_CHUNK: usize = 256;
+/// Constant factor of the first spherical harmonic, `1 / (2 sqrt(pi))`.
+const SH_0: f32 = 0.282_094_8;
+/// The higher colour coefficients span -4 to 4.
+const REST_SPAN: f32 = 8.0;
+/// Opacities of 0 and 255 would have infinite logits; they are read as half a step inside.
+const LEAST_OPACITY: f32 = 0.5 / 255.0;
+
+/// Unpacks the splats of a file.
+pub(super) fn splats(header: &Header, bytes: &[u8]) -> Result<SplatArrays, String> {
+    let (chunks, vertices) = (header.table("chunk", bytes)?, header.table("vertex", bytes)?);
+    if vertices.n_rows().div_ceil(SPLATS_A_CHUNK) != chunks.n_rows() {
+        return Err(format!("{} splats do not fill {} chunks of 256", vertices.n_rows(), chunks.n_rows()));
+    }
+    let bounds = Bounds::of(&chunks)?;
+    let packed = vertices.columns(["packed_position", "packed_rotation", "packed_scale", "packed_color"])?;
+    let (sh_degree, rest) = match header.has_element("sh") {
+        true => rest_columns(&header.table("sh", bytes)?)?,
+        false => (0, Vec::new()),
+    };
+    let mut splats = SplatArrays { sh_degree, ..SplatArrays::default() };
+    for row in 0..vertices.n_rows() {
+        let chunk = row / SPLATS_A_CHUNK;
+        let [position, rotation, scale, color] = [0, 1, 2, 3].map(|ix| packed[ix].bits(row));
+        splats.means.push(bounds.position.between(chunk, thirds(position?)));
+        splats.rotations_wxyz.push(rotation_wxyz(rotation?));
+        splats.log_scales.push(bounds.log_scale.between(chunk, thirds(scale?)));
+        let [red, green, blue, opacity] = color?.to_be_bytes().map(|byte| f32::from(byte) / 255.0);
+        let opacity = opacity.clamp(LEAST_OPACITY, 1.0 - LEAST_OPACITY);
+        splats.opacity_logits.push((opacity / (1.0 - opacity)).ln());
+        splats.sh.push(bounds.color(chunk, [red, green, blue]).map(|value| (value - 0.5) / SH_0));
+        splats.sh.extend((0..rest.len() / 3).map(|ix| {
+            std::array::from_fn(|channel| higher_coefficient(rest[channel * (rest.len() / 3) + ix].f32(row)))
+        }));
+    }
+    Ok(splats)
+}
+
+/// The bounds of each chunk.
+struct Bounds<'a> {
+    position: Span<'a>,
+    log_scale: Span<'a>,
+    /// Older files have none: colour then spans 0 to 1.
+    color: Option<Span<'a>>,
+}
+
+impl<'a> Bounds<'a> {
+    fn of(chunks: &Table<'a>) -> Result<Self, String> {
+        let span = |least, most| -> Result<_, String> {
+            Ok(Span { least: chunks.columns(least)?, most: chunks.columns(most)? })
+        };
+        Ok(Self {
+            position: span(["min_x", "min_y", "min_z"], ["max_x", "max_y", "max_z"])?,
+            log_scale: span(
+                ["min_scale_x", "min_scale_y", "min_scale_z"],
+                ["max_scale_x", "max_scale_y", "max_scale_z"],
+            )?,
+            color: span(["min_r", "min_g", "min_b"], ["max_r", "max_g", "max_b"]).ok(),
+        })
+    }
+
+    fn color(&self, chunk: usize, frac: [f32; 3]) -> [f32; 3] {
+        self.color.as_ref().map_or(frac, |span| span.between(chunk, frac))
+    }
+}
+
+/// Least and largest value of three properties of each chunk.
+struct Span<'a> {
+    least: [Column<'a>; 3],
+    most: [Column<'a>; 3],
+}
+
+impl Span<'_> {
+    fn between(&self, chunk: usize, frac: [f32; 3]) -> [f32; 3] {
+        std::array::from_fn(|axis| {
+            let (least, most) = (self.least[axis].f32(chunk), self.most[axis].f32(chunk));
+            least + (most - least) * frac[axis]
+        })
+    }
+}
+
+/// Three fractions from 11, 10 and 11 bits, the first on top.
+fn thirds(bits: u32) -> [f32; 3] {
+    [frac(bits >> 21, 11), frac(bits >> 11, 10), frac(bits, 11)]
+}
+
+/// The lowest `n_bits` bits, from 0 to 1.
+fn frac(bits: u32, n_bits: u32) -> f32 {
+    let largest = (1_u32 << n_bits) - 1;
+    (bits & largest) as f32 / largest as f32
+}
+
+/// Two bits name the largest of w x y z, which is positive; the other three follow in 10 bits each.
+fn rotation_wxyz(bits: u32) -> [f32; 4] {
+    let largest_ix = (bits >> 30) as usize;
+    let others = [20, 10, 0].map(|shift| (frac(bits >> shift, 10) - 0.5) * std::f32::consts::SQRT_2);
+    let squares: f32 = others.iter().map(|part| part * part).sum();
+    let mut wxyz = [(1.0 - squares).max(0.0).sqrt(); 4];
+    for (part_ix, other) in (0..4).filter(|&ix| ix != largest_ix).zip(others) {
+        wxyz[part_ix] = other;
+    }
+    wxyz
+}
+
+/// A higher colour coefficient from its byte: the ends are exact, between them the middle of the step.
+fn higher_coefficient(byte: f32) -> f32 {
+    let frac = match byte {
+        0.0 => 0.0,
+        255.0 => 1.0,
+        _ => (byte + 0.5) / 256.0,
+    };
+    (frac - 0.5) * REST_SPAN
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Packs a rotation as the format asks.
+    fn packed(wxyz: [f32; 4]) -> u32 {
+        let largest_ix = (0..4).max_by(|&a, &b| wxyz[a].abs().total_cmp(&wxyz[b].abs())).unwrap();
+        let sign = wxyz[largest_ix].signum();
+        let others = (0..4).filter(|&ix| ix != largest_ix);
+        others.fold(u32::try_from(largest_ix).unwrap(), |bits, ix| {
+            let step = ((sign * wxyz[ix] / std::f32::consts::SQRT_2 + 0.5) * 1023.0).round();
+            (bits << 10) | step as u32
+        })
+    }
+
+    #[test]
+    fn rotations_survive_packing_whichever_part_is_largest() {
+        for rotation in [[0.9, 0.1, -0.3, 0.3], [0.1, -0.9, 0.3, 0.3], [0.3, 0.1, 0.9, -0.3], [-0.3, 0.3, 0.1, 0.9]] {
+            let norm = rotation.iter().map(|part: &f32| part * part).sum::<f32>().sqrt();
+            let rotation = rotation.map(|part| part / norm);
+            let got = rotation_wxyz(packed(rotation));
+            let dot: f32 = got.iter().zip(rotation).map(|(a, b)| a * b).sum();
+            assert!(dot.abs() > 0.999_99, "{rotation:?} became {got:?}");
+        }
+    }
+
+    #[test]
+    fn fractions_fill_their_bits() {
+        assert_eq!(thirds(0b11111111111_0000000000_00000000000), [1.0, 0.0, 0.0]);
+        assert_eq!(thirds(0b00000000000_1111111111_00000000000), [0.0, 1.0, 0.0]);
+        assert_eq!(thirds(0b00000000000_0000000000_11111111111), [0.0, 0.0, 1.0]);
+        assert_eq!([0.0, 255.0].map(higher_coefficient), [-4.0, 4.0]);
+    }
+}

@@ -1,0 +1,121 @@
+//! Splats as plain arrays, as files hold them.
+
+use crate::Error;
+
+/// Colour coefficients a splat has at most (degree 3).
+const MOST_COEFFICIENTS: usize = 16;
+
+/// A cloud of splats in the world frame: raw optimised values, one entry a splat.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct SplatArrays {
+    /// Centres, metres.
+    pub means: Vec<[f32; 3]>,
+    /// Logarithms of the standard deviations along the splat's own axes, metres.
+    pub log_scales: Vec<[f32; 3]>,
+    /// Rotations of the splat's axes, w first; any length but zero.
+    pub rotations_wxyz: Vec<[f32; 4]>,
+    /// Opacities before the logistic function.
+    pub opacity_logits: Vec<f32>,
+    /// Colour coefficients, red green blue; those of one splat stand together, the constant one first.
+    pub sh: Vec<[f32; 3]>,
+    /// Degree of the colour coefficients, 0 to 3.
+    pub sh_degree: u32,
+}
+
+impl SplatArrays {
+    /// Refuses arrays of different lengths, degrees above 3, values that are not finite and rotations of length zero.
+    pub fn checked(self) -> Result<Self, Error> {
+        if self.n_coefficients() > MOST_COEFFICIENTS {
+            return Err(Error::SplatArrays(format!("colour degree {}, at most 3", self.sh_degree)));
+        }
+        self.check_lengths()?;
+        self.check_finite()?;
+        match self.rotations_wxyz.iter().position(|rotation| rotation.iter().all(|&part| part == 0.0)) {
+            Some(splat_ix) => Err(Error::SplatArrays(format!("rotation of splat {splat_ix} has length zero"))),
+            None => Ok(self),
+        }
+    }
+
+    /// How many splats there are.
+    pub fn n_splats(&self) -> usize {
+        self.means.len()
+    }
+
+    /// Colour coefficients of one splat: 1, 4, 9 or 16.
+    pub fn n_coefficients(&self) -> usize {
+        (self.sh_degree as usize + 1).pow(2)
+    }
+
+    fn check_lengths(&self) -> Result<(), Error> {
+        let n_splats = self.n_splats();
+        let arrays = [
+            ("log scales", self.log_scales.len(), n_splats),
+            ("rotations", self.rotations_wxyz.len(), n_splats),
+            ("opacities", self.opacity_logits.len(), n_splats),
+            ("colour coefficients", self.sh.len(), n_splats * self.n_coefficients()),
+        ];
+        for (what, got, expected) in arrays {
+            if got != expected {
+                return Err(Error::SplatArrays(format!("{got} {what} for {n_splats} means, expected {expected}")));
+            }
+        }
+        Ok(())
+    }
+
+    fn check_finite(&self) -> Result<(), Error> {
+        let not_finite = |values: &[f32]| values.iter().position(|value| !value.is_finite());
+        let arrays = [
+            ("mean", not_finite(self.means.as_flattened()), 3),
+            ("log scale", not_finite(self.log_scales.as_flattened()), 3),
+            ("rotation", not_finite(self.rotations_wxyz.as_flattened()), 4),
+            ("opacity", not_finite(&self.opacity_logits), 1),
+            ("colour", not_finite(self.sh.as_flattened()), 3 * self.n_coefficients()),
+        ];
+        for (what, position, values_per_splat) in arrays {
+            if let Some(position) = position {
+                let splat_ix = position / values_per_splat;
+                return Err(Error::SplatArrays(format!("{what} of splat {splat_ix} is not finite")));
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn two_splats() -> SplatArrays {
+        SplatArrays {
+            means: vec![[0.0; 3], [1.0, 2.0, 3.0]],
+            log_scales: vec![[-3.0; 3]; 2],
+            rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; 2],
+            opacity_logits: vec![0.0, 2.0],
+            sh: vec![[0.1; 3]; 8],
+            sh_degree: 1,
+        }
+    }
+
+    /// What the check says about two splats changed so.
+    fn complaint(change: impl FnOnce(&mut SplatArrays)) -> String {
+        let mut splats = two_splats();
+        change(&mut splats);
+        splats.checked().unwrap_err().to_string()
+    }
+
+    #[test]
+    fn good_arrays_pass_unchanged() {
+        assert_eq!(two_splats().checked().unwrap(), two_splats());
+        assert_eq!(SplatArrays::default().checked().unwrap().n_splats(), 0);
+    }
+
+    #[test]
+    fn each_wrong_array_is_named() {
+        assert_eq!(complaint(|s| s.log_scales.truncate(1)), "splats: 1 log scales for 2 means, expected 2");
+        assert_eq!(complaint(|s| s.sh.truncate(5)), "splats: 5 colour coefficients for 2 means, expected 8");
+        assert_eq!(complaint(|s| s.sh_degree = 4), "splats: colour degree 4, at most 3");
+        assert_eq!(complaint(|s| s.means[1][2] = f32::NAN), "splats: mean of splat 1 is not finite");
+        assert_eq!(complaint(|s| s.sh[4][0] = f32::INFINITY), "splats: colour of splat 1 is not finite");
+        assert_eq!(complaint(|s| s.rotations_wxyz[0] = [0.0; 4]), "splats: rotation of splat 0 has length zero");
+    }
+}
