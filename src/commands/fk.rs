@@ -1,0 +1,96 @@
+//! `fieldrig fk`: where a robot's tip is when its joints are so.
+
+use crate::print;
+use anyhow::{Context, bail, ensure};
+use kinematics::urdf::Robot;
+use kinematics::{Chain, transform};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// Flags of `fk`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Robot description (URDF, expanded from xacro; meshes are not read)
+    urdf: PathBuf,
+    /// Link whose pose is computed
+    #[arg(long, value_name = "LINK")]
+    tip: String,
+    /// Link the poses are told in [default: the link above all others]
+    #[arg(long, value_name = "LINK")]
+    base: Option<String>,
+    /// Joint values: {"joint_names": ["j1", ...], "configurations": [[0.1, ...], ...]}
+    ///
+    /// Radians for turning joints, metres for sliding ones. Names may come in any order. Joints of the robot that do not
+    /// move the tip may be there and change nothing, and so may joints that mimic others: they follow those.
+    #[arg(long, value_name = "FILE.json", verbatim_doc_comment)]
+    joints: PathBuf,
+}
+
+/// What the joints file holds.
+#[derive(Debug, Deserialize)]
+struct JointsFile {
+    joint_names: Vec<String>,
+    configurations: Vec<Vec<f64>>,
+}
+
+/// What is printed.
+#[derive(Debug, Serialize)]
+struct Poses<'a> {
+    tip: &'a str,
+    /// `base_from_tip`, row major.
+    poses: Vec<[f64; 16]>,
+}
+
+/// Prints one pose for every configuration, as one JSON object.
+pub(crate) fn run(args: Args) -> anyhow::Result<()> {
+    let urdf = read(&args.urdf)?;
+    let robot = Robot::parse(&urdf).with_context(|| args.urdf.display().to_string())?;
+    let chain = chain(&robot, &args).with_context(|| args.urdf.display().to_string())?;
+    let joints = read(&args.joints)?;
+    let poses = poses(&robot, &chain, &joints).with_context(|| args.joints.display().to_string())?;
+    print::json(&Poses { tip: &args.tip, poses })
+}
+
+fn read(path: &Path) -> anyhow::Result<String> {
+    std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
+}
+
+fn chain(robot: &Robot, args: &Args) -> Result<Chain, kinematics::Error> {
+    match &args.base {
+        Some(base) => Chain::new(robot, base, &args.tip),
+        None => Chain::new(robot, robot.root()?, &args.tip),
+    }
+}
+
+fn poses(robot: &Robot, chain: &Chain, joints: &str) -> anyhow::Result<Vec<[f64; 16]>> {
+    let joints: JointsFile = serde_json::from_str(joints)?;
+    check_names(robot, &joints.joint_names)?;
+    let order = chain.order_in(&joints.joint_names)?;
+    let n_names = joints.joint_names.len();
+    let pose = |(at, values): (usize, &Vec<f64>)| {
+        ensure!(
+            values.len() == n_names,
+            "configuration {at} (from 0) has {} values, joint_names has {n_names}",
+            values.len()
+        );
+        let q: Vec<f64> = order.iter().map(|&column| values[column]).collect();
+        let base_from_tip = chain.forward(&q).with_context(|| format!("configuration {at} (from 0)"))?;
+        Ok(transform::to_rows(&base_from_tip))
+    };
+    joints.configurations.iter().enumerate().map(pose).collect()
+}
+
+fn check_names(robot: &Robot, names: &[String]) -> anyhow::Result<()> {
+    for (at, name) in names.iter().enumerate() {
+        ensure!(!names[..at].contains(name), "joint {name:?} is named twice in joint_names");
+        if robot.joint(name).is_none() {
+            let nearest = robot.joints().iter().max_by(|a, b| {
+                let likeness = |joint: &str| strsim::jaro_winkler(joint, name);
+                likeness(&a.name).total_cmp(&likeness(&b.name))
+            });
+            let hint = nearest.map(|joint| format!("; the nearest is {:?}", joint.name)).unwrap_or_default();
+            bail!("joint {name:?} is not in the URDF{hint}");
+        }
+    }
+    Ok(())
+}
