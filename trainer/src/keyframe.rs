@@ -76,4 +76,6 @@ pub struct Truth {
     pub rgba_srgb: Arc<[u8]>,
     /// True pose at the keyframe's stamp.
     pub world_from_camera: Transform,
+    /// PSNR, dB, of the keyframe's image against itself before the noise: no model can score more. `None` without noise.
+    pub psnr_ceiling: Option<f64>,
 }
