@@ -1,5 +1,6 @@
-//! What can go wrong with a device.
+//! What can go wrong with a device or a recording.
 
+use kinematics::Stamp;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -15,6 +16,26 @@ pub enum Error {
         /// How long the call waited.
         waited: Duration,
     },
+    /// An arm stayed silent.
+    #[error("arm: no joint readings within {waited:?}")]
+    NoJoints {
+        /// How long the call waited.
+        waited: Duration,
+    },
+    /// A simulated device failed.
+    #[error("simulated rig: {reason}")]
+    Simulation {
+        /// What the simulator says.
+        reason: String,
+    },
+    /// A thread that reads a device cannot be started.
+    #[error("cannot start the thread of {device}")]
+    Thread {
+        /// Which device.
+        device: String,
+        /// Why.
+        source: std::io::Error,
+    },
     /// A file cannot be opened.
     #[error("cannot open {path:?}")]
     Open {
@@ -22,5 +43,143 @@ pub enum Error {
         path: PathBuf,
         /// Why.
         source: std::io::Error,
+    },
+    /// A compressed image is broken.
+    #[error("camera {camera:?}: the image at {} ns does not decode", stamp.0)]
+    Undecodable {
+        /// Name in the rig file.
+        camera: String,
+        /// Stamp of the image.
+        stamp: Stamp,
+        /// Why.
+        source: image::ImageError,
+    },
+    /// An image has another size than announced.
+    #[error("camera {camera:?}: the image at {} ns is {got_px:?} pixels, announced were {expected_px:?}", stamp.0)]
+    ImageSize {
+        /// Name in the rig file.
+        camera: String,
+        /// Stamp of the image.
+        stamp: Stamp,
+        /// Size in the file.
+        got_px: [u32; 2],
+        /// Size announced.
+        expected_px: [u32; 2],
+    },
+    /// An uncompressed image has too few or too many bytes.
+    #[error("camera {camera:?}: the image at {} ns has {got_bytes} bytes, its size and format need {expected_bytes}", stamp.0)]
+    ImageLength {
+        /// Name in the rig file.
+        camera: String,
+        /// Stamp of the image.
+        stamp: Stamp,
+        /// Bytes there.
+        got_bytes: usize,
+        /// Bytes needed.
+        expected_bytes: usize,
+    },
+    /// Colour was asked of a depth image or depth of a colour image.
+    #[error("camera {camera:?}: the image at {} ns holds no {wanted}", stamp.0)]
+    WrongKind {
+        /// Name in the rig file.
+        camera: String,
+        /// Stamp of the image.
+        stamp: Stamp,
+        /// "color" or "depth".
+        wanted: &'static str,
+    },
+    /// A file that is no recording.
+    #[error("{path:?} is not a recording: it does not begin like an MCAP file")]
+    NotARecording {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A recording that holds no sample of a rig.
+    #[error("the recording {path:?} holds no images or joint readings of this program")]
+    EmptyRecording {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A recording cannot be written further, for instance because the disk is full.
+    #[error("cannot write the recording {path:?}; what was written before stays readable")]
+    Record {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: mcap::McapError,
+    },
+    /// A recording cannot be read further for another reason than its end.
+    #[error("cannot read the recording {path:?}")]
+    Replay {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// A message of a recording does not decode.
+    #[error("the recording {path:?} holds a broken message on {topic:?}")]
+    BrokenMessage {
+        /// The file.
+        path: PathBuf,
+        /// Topic of the message.
+        topic: String,
+        /// Why.
+        source: crate::wire::Malformed,
+    },
+    /// A folder is no dataset.
+    #[error("{path:?} is not a dataset: it holds neither transforms.json (nerfstudio) nor rgb.txt (TUM RGB-D)")]
+    NotADataset {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// A file of a dataset does not say what it should.
+    #[error("{path:?}: {reason}")]
+    DatasetFile {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong, with the frame or line.
+        reason: String,
+    },
+    /// No frame of a dataset can be used.
+    #[error("{path:?} holds no usable image: {n_missing} are not there, {n_unusable} cannot be used{first_reason}")]
+    EmptyDataset {
+        /// The folder.
+        path: PathBuf,
+        /// Images that are not there.
+        n_missing: usize,
+        /// Images that are broken or have no pose.
+        n_unusable: usize,
+        /// The first of these and why, in brackets; empty when there is none.
+        first_reason: String,
+    },
+    /// Nothing tells the lens parameters of a TUM folder.
+    #[error("{path:?}: no lens parameters: put fx fy cx cy [k1 k2 p1 p2 k3] into calibration.txt, or keep freiburg1, 2 or 3 in the name")]
+    NoCamera {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// An image of a dataset does not decode.
+    #[error("{path:?} does not decode")]
+    DatasetImage {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: image::ImageError,
+    },
+    /// An image of a dataset has another size than its frame.
+    #[error("{path:?} is {got_px:?} pixels, expected {expected_px:?}")]
+    DatasetImageSize {
+        /// The file.
+        path: PathBuf,
+        /// Size in the file.
+        got_px: [u32; 2],
+        /// Size of the frame.
+        expected_px: [u32; 2],
+    },
+    /// A depth image is not 16 bits of grey.
+    #[error("{path:?} is no depth image: expected 16-bit grey")]
+    NotDepth {
+        /// The file.
+        path: PathBuf,
     },
 }

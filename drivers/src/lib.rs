@@ -1,9 +1,15 @@
 //! Devices, recordings and datasets behind a few traits; what comes out is stamped samples.
 
+mod decode;
+pub mod dataset;
 mod error;
+mod live;
+pub mod recording;
 mod sample;
+pub mod wire;
 
 pub use error::Error;
+pub use live::Live;
 pub use sample::{BasePose, Image, PixelFormat, Sample, TruthImage};
 
 use kinematics::{Intrinsics, JointState};

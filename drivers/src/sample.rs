@@ -74,3 +74,15 @@ pub enum Sample {
     /// Ground truth of a simulated image.
     Truth(TruthImage),
 }
+
+impl Sample {
+    /// When it was so.
+    pub fn stamp(&self) -> Stamp {
+        match self {
+            Self::Image(image) => image.stamp,
+            Self::Joints(state) => state.stamp,
+            Self::Base(pose) => pose.stamp,
+            Self::Truth(truth) => truth.image.stamp,
+        }
+    }
+}

@@ -1,0 +1,330 @@
+//! Live devices as one source of samples: a thread a device, a bounded queue between it and the caller.
+
+use crate::{Arm, Camera, Error, Image, Sample, Source};
+use std::collections::VecDeque;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+/// Images of one camera that may wait for a slow caller; older ones go.
+const MAX_IMAGES: usize = 8;
+/// Joint readings that may wait: one second at 1 kHz.
+const MAX_JOINTS: usize = 1000;
+/// A device that says nothing for this long is an error.
+const MAX_SILENCE: Duration = Duration::from_secs(5);
+/// How long one wait on a device lasts, and so how soon its thread notices that it is to stop.
+const POLL: Duration = Duration::from_millis(100);
+
+/// All devices of a rig, read by a thread each.
+///
+/// A slow caller loses the oldest samples of a device: images are counted in [`Image::n_skipped`] of the next image of the
+/// same kind, joint readings in [`Live::n_joints_dropped`]. The first error of a device is returned once by
+/// [`Source::next_sample`] and ends the source. Dropping it stops the threads.
+#[derive(Debug)]
+pub struct Live {
+    shared: Arc<Shared>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+#[derive(Debug)]
+struct Shared {
+    state: Mutex<State>,
+    arrived: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    /// One queue a device.
+    queues: Vec<VecDeque<Sample>>,
+    /// Images dropped and not yet told, by device: colour and depth.
+    dropped: Vec<[u64; 2]>,
+    n_joints_dropped: u64,
+    error: Option<Error>,
+    failed: bool,
+    n_running: usize,
+    stop: bool,
+}
+
+impl Live {
+    /// Starts reading.
+    pub fn new(cameras: Vec<Box<dyn Camera>>, arm: Option<Box<dyn Arm>>) -> Result<Self, Error> {
+        let n_devices = cameras.len() + usize::from(arm.is_some());
+        let state = State {
+            queues: vec![VecDeque::new(); n_devices],
+            dropped: vec![[0; 2]; n_devices],
+            n_running: n_devices,
+            ..State::default()
+        };
+        let mut live = Self {
+            shared: Arc::new(Shared { state: Mutex::new(state), arrived: Condvar::new() }),
+            threads: Vec::new(),
+        };
+        let n_cameras = cameras.len();
+        for (device_ix, mut camera) in cameras.into_iter().enumerate() {
+            let name = camera.name().to_owned();
+            live.spawn(format!("camera {name:?}"), move |shared| {
+                read_until_stopped(
+                    shared,
+                    device_ix,
+                    MAX_IMAGES,
+                    || match camera.next_image(POLL) {
+                        Err(Error::NoImage { .. }) => Ok(None),
+                        image => image.map(Sample::Image).map(Some),
+                    },
+                    |waited| Error::NoImage { camera: name.clone(), waited },
+                );
+            })?;
+        }
+        if let Some(mut arm) = arm {
+            live.spawn("arm".to_owned(), move |shared| {
+                read_until_stopped(
+                    shared,
+                    n_cameras,
+                    MAX_JOINTS,
+                    || match arm.read(POLL) {
+                        Err(Error::NoJoints { .. }) => Ok(None),
+                        state => state.map(Sample::Joints).map(Some),
+                    },
+                    |waited| Error::NoJoints { waited },
+                );
+            })?;
+        }
+        Ok(live)
+    }
+
+    /// Joint readings lost so far because the caller was slow.
+    pub fn n_joints_dropped(&self) -> u64 {
+        self.shared.lock().n_joints_dropped
+    }
+
+    fn spawn(&mut self, device: String, read: impl FnOnce(&Shared) + Send + 'static) -> Result<(), Error> {
+        let shared = Arc::clone(&self.shared);
+        let thread = std::thread::Builder::new().name(device.clone()).spawn(move || {
+            read(&shared);
+            shared.lock().n_running -= 1;
+            shared.arrived.notify_all();
+        });
+        self.threads.push(thread.map_err(|source| Error::Thread { device, source })?);
+        Ok(())
+    }
+}
+
+/// The loop of one device's thread: `read` waits [`POLL`] and gives `None` when nothing came.
+fn read_until_stopped(
+    shared: &Shared,
+    device_ix: usize,
+    max_waiting: usize,
+    mut read: impl FnMut() -> Result<Option<Sample>, Error>,
+    silent: impl Fn(Duration) -> Error,
+) {
+    let mut waited = Duration::ZERO;
+    loop {
+        let sample = read();
+        let mut state = shared.lock();
+        if state.stop {
+            return;
+        }
+        let error = match sample {
+            Ok(Some(sample)) => {
+                waited = Duration::ZERO;
+                state.put(device_ix, max_waiting, sample);
+                shared.arrived.notify_all();
+                continue;
+            }
+            Ok(None) if waited + POLL < MAX_SILENCE => {
+                waited += POLL;
+                continue;
+            }
+            Ok(None) => silent(waited + POLL),
+            Err(error) => error,
+        };
+        if !state.failed {
+            state.failed = true;
+            state.error = Some(error);
+        }
+        return;
+    }
+}
+
+impl Shared {
+    /// The state, also after a thread panicked while it held it: queues are never left half changed.
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl State {
+    /// Queues a sample; where there is no room the oldest of this device goes and is counted.
+    fn put(&mut self, device_ix: usize, max_waiting: usize, mut sample: Sample) {
+        if self.queues[device_ix].len() >= max_waiting {
+            match self.queues[device_ix].pop_front() {
+                Some(Sample::Image(lost)) => self.tell_loss(device_ix, &lost, &mut sample),
+                Some(_) => self.n_joints_dropped += 1,
+                None => {}
+            }
+        }
+        self.queues[device_ix].push_back(sample);
+    }
+
+    /// Adds a lost image and what was lost before it to the next image of its kind.
+    fn tell_loss(&mut self, device_ix: usize, lost: &Image, newest: &mut Sample) {
+        let same_kind =
+            |sample: &&mut Sample| matches!(sample, Sample::Image(image) if image.is_depth() == lost.is_depth());
+        let pending = &mut self.dropped[device_ix][usize::from(lost.is_depth())];
+        *pending += lost.n_skipped + 1;
+        if let Some(Sample::Image(next)) =
+            self.queues[device_ix].iter_mut().chain(std::iter::once(newest)).find(same_kind)
+        {
+            next.n_skipped += std::mem::take(pending);
+        }
+    }
+
+    /// The oldest waiting sample of all devices.
+    fn take(&mut self) -> Option<Sample> {
+        let heads = self.queues.iter().enumerate().filter_map(|(ix, queue)| Some((queue.front()?.stamp(), ix)));
+        let (_, device_ix) = heads.min()?;
+        self.queues[device_ix].pop_front()
+    }
+}
+
+impl Source for Live {
+    fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
+        let mut state = self.shared.lock();
+        loop {
+            if let Some(error) = state.error.take() {
+                return Err(error);
+            }
+            if let Some(sample) = state.take() {
+                return Ok(Some(sample));
+            }
+            if state.failed || state.n_running == 0 {
+                return Ok(None);
+            }
+            state = self.shared.arrived.wait(state).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+}
+
+impl Drop for Live {
+    fn drop(&mut self) {
+        self.shared.lock().stop = true;
+        for thread in self.threads.drain(..) {
+            // A thread that panicked has printed why; there is nothing left to stop.
+            let _ = thread.join();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::PixelFormat;
+    use kinematics::{Intrinsics, JointState, Lens, Stamp};
+
+    /// A camera that delivers numbered images as fast as it is asked, then fails.
+    struct Fast {
+        intrinsics: Intrinsics,
+        n_images: i64,
+        next: i64,
+    }
+
+    impl Camera for Fast {
+        fn name(&self) -> &str {
+            "fast"
+        }
+        fn intrinsics(&self) -> &Intrinsics {
+            &self.intrinsics
+        }
+        fn next_image(&mut self, _timeout: Duration) -> Result<Image, Error> {
+            if self.next == self.n_images {
+                return Err(Error::Simulation { reason: "cable pulled".into() });
+            }
+            self.next += 1;
+            Ok(image(self.next, self.next % 2 == 0))
+        }
+    }
+
+    fn image(stamp: i64, depth: bool) -> Image {
+        let format = if depth { PixelFormat::DepthU16 { metres_per_count: 1e-3 } } else { PixelFormat::Gray8 };
+        Image {
+            camera: "fast".into(),
+            stamp: Stamp(stamp),
+            size_px: [1, 1],
+            format,
+            data: [0].into(),
+            exposure_secs: None,
+            n_skipped: 0,
+        }
+    }
+
+    fn fast(n_images: i64) -> Box<dyn Camera> {
+        let intrinsics = Intrinsics {
+            size_px: [1, 1],
+            focal_px: [1.0; 2],
+            principal_px: [0.5; 2],
+            lens: Lens::Pinhole,
+            rectified: true,
+        };
+        Box::new(Fast { intrinsics, n_images, next: 0 })
+    }
+
+    struct Still {
+        next: i64,
+    }
+
+    impl Arm for Still {
+        fn joint_names(&self) -> &[String] {
+            &[]
+        }
+        fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
+            if self.next == 3 {
+                std::thread::sleep(timeout);
+                return Err(Error::NoJoints { waited: timeout });
+            }
+            self.next += 1;
+            Ok(JointState { stamp: Stamp(self.next), position: vec![], velocity: vec![], effort: vec![] })
+        }
+    }
+
+    #[test]
+    fn a_slow_caller_gets_the_newest_images_and_the_count_of_the_lost_ones() {
+        let mut live = Live::new(vec![fast(101)], None).expect("threads start");
+        while live.shared.lock().n_running > 0 {
+            std::thread::yield_now();
+        }
+        // The error comes first: what a broken device said before it is no longer worth waiting for.
+        assert!(live.next_sample().expect_err("the cable").to_string().contains("cable pulled"));
+        let mut stamps = Vec::new();
+        let mut n_skipped = [0; 2];
+        while let Some(Sample::Image(image)) = live.next_sample().expect("told once") {
+            stamps.push(image.stamp.0);
+            n_skipped[usize::from(image.is_depth())] += image.n_skipped;
+        }
+        assert_eq!(stamps, (94..=101).collect::<Vec<_>>());
+        assert_eq!(n_skipped, [47, 46], "51 colour images with 4 delivered, 50 depth images with 4 delivered");
+    }
+
+    #[test]
+    fn joints_and_images_come_in_stamp_order_and_dropping_stops_the_threads() {
+        let mut live = Live::new(vec![], Some(Box::new(Still { next: 0 }))).expect("threads start");
+        let stamps: Vec<_> =
+            (0..3).map(|_| live.next_sample().expect("alive").expect("three readings").stamp()).collect();
+        assert_eq!(stamps, [Stamp(1), Stamp(2), Stamp(3)]);
+        let shared = Arc::clone(&live.shared);
+        drop(live);
+        assert_eq!(shared.lock().n_running, 0);
+    }
+
+    #[test]
+    fn samples_of_several_devices_are_merged_by_stamp() {
+        let mut state = State { queues: vec![VecDeque::new(); 2], dropped: vec![[0; 2]; 2], ..State::default() };
+        for stamp in [2, 5] {
+            state.put(0, 8, Sample::Image(image(stamp, false)));
+        }
+        for stamp in [1, 3, 4] {
+            state.put(1, 8, Sample::Image(image(stamp, true)));
+        }
+        let order: Vec<_> = std::iter::from_fn(|| state.take()).map(|sample| sample.stamp().0).collect();
+        assert_eq!(order, [1, 2, 3, 4, 5]);
+    }
+}

@@ -1,0 +1,199 @@
+//! Reads samples back from an MCAP file, a chunk at a time.
+//!
+//! The file is read from front to back without its index, so a recording that was cut off anywhere gives every sample
+//! before the cut.
+
+use super::topic::Topic;
+use crate::wire::{Malformed, foxglove, joint_state};
+use crate::{BasePose, Error, Image, Sample, Source, TruthImage};
+use mcap::McapError;
+use mcap::records::Record;
+use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Longer records than this are taken for damage; the largest real one is a chunk with one image in it.
+const MAX_RECORD_BYTES: usize = 512 << 20;
+
+/// A recording being replayed: a [`Source`] with the samples in the order in which they were recorded.
+#[derive(Debug)]
+pub struct Recording {
+    path: PathBuf,
+    file: BufReader<File>,
+    reader: Reader,
+    schemas: BTreeMap<u16, String>,
+    channels: BTreeMap<u16, Channel>,
+    attachments: BTreeMap<String, Vec<u8>>,
+    /// Parts of the ground truth that is not complete yet.
+    true_color: Option<Image>,
+    true_depth_m: Option<Arc<[f32]>>,
+    first: Option<Sample>,
+    n_samples: u64,
+    damage: Option<String>,
+    ended: bool,
+}
+
+#[derive(Clone, Debug)]
+struct Channel {
+    topic: Topic,
+    topic_name: String,
+    schema_name: String,
+}
+
+struct Reader(LinearReader);
+
+impl std::fmt::Debug for Reader {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Reader")
+    }
+}
+
+impl Recording {
+    /// Opens a recording; fails when there is none, when it is no MCAP file, and when it holds no sample of ours.
+    pub fn open(path: &Path) -> Result<Self, Error> {
+        let open = |source| Error::Open { path: path.to_owned(), source };
+        let mut file = File::open(path).map_err(open)?;
+        let mut magic = [0; mcap::MAGIC.len()];
+        match file.read_exact(&mut magic) {
+            Ok(()) if magic == mcap::MAGIC => {}
+            Err(e) if e.kind() != std::io::ErrorKind::UnexpectedEof => return Err(open(e)),
+            _ => return Err(Error::NotARecording { path: path.to_owned() }),
+        }
+        let options = LinearReaderOptions::default()
+            .with_skip_start_magic(true)
+            .with_validate_chunk_crcs(true)
+            .with_record_length_limit(MAX_RECORD_BYTES);
+        let mut recording = Self {
+            path: path.to_owned(),
+            file: BufReader::with_capacity(1 << 20, file),
+            reader: Reader(LinearReader::new_with_options(options)),
+            schemas: BTreeMap::new(),
+            channels: BTreeMap::new(),
+            attachments: BTreeMap::new(),
+            true_color: None,
+            true_depth_m: None,
+            first: None,
+            n_samples: 0,
+            damage: None,
+            ended: false,
+        };
+        recording.first = recording.read_sample()?;
+        if recording.first.is_none() {
+            return Err(Error::EmptyRecording { path: path.to_owned() });
+        }
+        Ok(recording)
+    }
+
+    /// A file kept in the recording, such as [`super::RIG_FILE`].
+    pub fn attachment(&self, name: &str) -> Option<&[u8]> {
+        self.attachments.get(name).map(Vec::as_slice)
+    }
+
+    /// Says how the file is damaged and how much of it could be read; known once the samples have ended.
+    pub fn damage(&self) -> Option<&str> {
+        self.damage.as_deref()
+    }
+
+    fn read_sample(&mut self) -> Result<Option<Sample>, Error> {
+        while !self.ended {
+            match self.reader.0.next_event() {
+                None => self.ended = true,
+                Some(Ok(LinearReadEvent::ReadRequest(n_bytes))) => {
+                    let read = self.file.read(self.reader.0.insert(n_bytes));
+                    let n_bytes = read.map_err(|source| Error::Replay { path: self.path.clone(), source })?;
+                    self.reader.0.notify_read(n_bytes);
+                }
+                Some(Ok(LinearReadEvent::Record { data, opcode })) => {
+                    match mcap::parse_record(opcode, data).map(Record::into_owned) {
+                        Ok(record) => {
+                            if let Some(sample) = self.take(record)? {
+                                self.n_samples += 1;
+                                return Ok(Some(sample));
+                            }
+                        }
+                        Err(e) => self.end_damaged(&e),
+                    }
+                }
+                Some(Err(e)) => self.end_damaged(&e),
+            }
+        }
+        Ok(None)
+    }
+
+    fn end_damaged(&mut self, error: &McapError) {
+        self.ended = true;
+        let how = match error {
+            McapError::UnexpectedEof | McapError::UnexpectedEoc => "is cut off".to_owned(),
+            other => format!("is damaged ({other})"),
+        };
+        self.damage = Some(format!("the recording {:?} {how} after {} readable samples", self.path, self.n_samples));
+    }
+
+    /// Takes in one record; gives a sample when one is complete.
+    fn take(&mut self, record: Record<'static>) -> Result<Option<Sample>, Error> {
+        match record {
+            Record::Schema { header, .. } => {
+                self.schemas.insert(header.id, header.name);
+            }
+            Record::Channel(channel) => {
+                if let Some(topic) = Topic::from_name(&channel.topic) {
+                    let schema_name = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
+                    self.channels.insert(channel.id, Channel { topic, topic_name: channel.topic, schema_name });
+                }
+            }
+            Record::Attachment { header, data, .. } => {
+                self.attachments.insert(header.name, data.into_owned());
+            }
+            Record::Message { header, data } => {
+                if let Some(channel) = self.channels.get(&header.channel_id).cloned() {
+                    return self.decode(&channel, &data).map_err(|source| Error::BrokenMessage {
+                        path: self.path.clone(),
+                        topic: channel.topic_name,
+                        source,
+                    });
+                }
+            }
+            _ => {}
+        }
+        Ok(None)
+    }
+
+    fn decode(&mut self, channel: &Channel, data: &[u8]) -> Result<Option<Sample>, Malformed> {
+        let image = || foxglove::decode_image(&channel.schema_name, data);
+        Ok(Some(match &channel.topic {
+            Topic::Color(_) | Topic::Depth(_) => Sample::Image(image()?),
+            Topic::Joints => Sample::Joints(joint_state::decode(data)?),
+            Topic::Base => {
+                let (stamp, world_from_base) = foxglove::decode_transform(data)?;
+                Sample::Base(BasePose { stamp, world_from_base })
+            }
+            Topic::Calibration(_) => return Ok(None),
+            Topic::TrueColor(_) => {
+                self.true_color = Some(image()?);
+                return Ok(None);
+            }
+            Topic::TrueDepth(_) => {
+                self.true_depth_m = Some(foxglove::decode_depth_m(data)?);
+                return Ok(None);
+            }
+            Topic::TruePose(_) => {
+                let (world_from_camera, psnr_ceiling) = foxglove::decode_true_pose(data)?;
+                let image = self.true_color.take().ok_or(Malformed::Missing { name: "true color of this pose" })?;
+                let depth_m = self.true_depth_m.take().unwrap_or_else(|| Arc::from([]));
+                Sample::Truth(TruthImage { image, depth_m, world_from_camera, psnr_ceiling })
+            }
+        }))
+    }
+}
+
+impl Source for Recording {
+    fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
+        match self.first.take() {
+            Some(sample) => Ok(Some(sample)),
+            None => self.read_sample(),
+        }
+    }
+}

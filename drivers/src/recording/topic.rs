@@ -1,0 +1,116 @@
+//! Topics of a recording and what each holds.
+
+use crate::wire::{descriptor, joint_state};
+
+/// What the messages of a topic are.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Topic {
+    /// Colour images of a camera.
+    Color(String),
+    /// Depth images of a camera.
+    Depth(String),
+    /// Lens parameters of a camera, for viewers; the rig file holds them too.
+    Calibration(String),
+    /// Noise-free colour of a simulated camera; comes before the other two of the same image.
+    TrueColor(String),
+    /// Noise-free depth of a simulated camera; absent when it was not asked for.
+    TrueDepth(String),
+    /// True pose of a simulated camera; completes one ground truth.
+    TruePose(String),
+    /// Joint readings.
+    Joints,
+    /// Poses of the base.
+    Base,
+}
+
+impl Topic {
+    /// The topic's name in the file.
+    pub(super) fn name(&self) -> String {
+        match self {
+            Self::Color(camera) => format!("/camera/{camera}/color"),
+            Self::Depth(camera) => format!("/camera/{camera}/depth"),
+            Self::Calibration(camera) => format!("/camera/{camera}/calibration"),
+            Self::TrueColor(camera) => format!("/camera/{camera}/truth/color"),
+            Self::TrueDepth(camera) => format!("/camera/{camera}/truth/depth"),
+            Self::TruePose(camera) => format!("/camera/{camera}/truth/pose"),
+            Self::Joints => "/joints".into(),
+            Self::Base => "/base".into(),
+        }
+    }
+
+    /// The topic of this name, if it is one of ours.
+    pub(super) fn from_name(name: &str) -> Option<Self> {
+        match name {
+            "/joints" => return Some(Self::Joints),
+            "/base" => return Some(Self::Base),
+            _ => {}
+        }
+        let (camera, kind) = name.strip_prefix("/camera/")?.split_once('/')?;
+        let camera = camera.to_owned();
+        Some(match kind {
+            "color" => Self::Color(camera),
+            "depth" => Self::Depth(camera),
+            "calibration" => Self::Calibration(camera),
+            "truth/color" => Self::TrueColor(camera),
+            "truth/depth" => Self::TrueDepth(camera),
+            "truth/pose" => Self::TruePose(camera),
+            _ => return None,
+        })
+    }
+}
+
+/// Name, encoding and bytes of the schema that a channel carries, and how its messages are encoded.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Encoding {
+    pub(super) schema_name: &'static str,
+    pub(super) schema_encoding: &'static str,
+    pub(super) schema: Vec<u8>,
+    pub(super) message_encoding: &'static str,
+}
+
+impl Encoding {
+    /// One of Foxglove's messages, in protobuf.
+    pub(super) fn protobuf(schema: descriptor::Schema) -> Self {
+        Self {
+            schema_name: schema.name,
+            schema_encoding: "protobuf",
+            schema: schema.file_descriptor_set(),
+            message_encoding: "protobuf",
+        }
+    }
+
+    /// Our joint readings, in JSON.
+    pub(super) fn joint_state() -> Self {
+        Self {
+            schema_name: joint_state::SCHEMA_NAME,
+            schema_encoding: "jsonschema",
+            schema: joint_state::SCHEMA.into(),
+            message_encoding: "json",
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_topic_is_found_by_its_name() {
+        let camera = || "wrist".to_owned();
+        for topic in [
+            Topic::Color(camera()),
+            Topic::Depth(camera()),
+            Topic::Calibration(camera()),
+            Topic::TrueColor(camera()),
+            Topic::TrueDepth(camera()),
+            Topic::TruePose(camera()),
+            Topic::Joints,
+            Topic::Base,
+        ] {
+            assert_eq!(Topic::from_name(&topic.name()), Some(topic));
+        }
+        for strange in ["/camera/wrist", "/camera/wrist/infrared", "/tf", ""] {
+            assert_eq!(Topic::from_name(strange), None, "{strange}");
+        }
+    }
+}

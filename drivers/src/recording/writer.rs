@@ -1,0 +1,195 @@
+//! Writes samples to an MCAP file as they come.
+//!
+//! Chunks are closed at least once a second of sample time, so whatever stops the program costs at most that second.
+
+use super::topic::{Encoding, Topic};
+use crate::wire::{descriptor, foxglove, joint_state};
+use crate::{Error, Image, PixelFormat, Sample, TruthImage};
+use kinematics::{Intrinsics, Stamp};
+use mcap::records::MessageHeader;
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{BufWriter, Seek, Write};
+use std::path::{Path, PathBuf};
+
+const CHUNK_BYTES: u64 = 4 << 20;
+const FLUSH_NANOS: i64 = 1_000_000_000;
+
+/// What a recording says about its rig before the first sample.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct About<'a> {
+    /// Files kept inside, by name: the settled rig file, the robot's description.
+    pub files: &'a [(&'a str, &'a [u8])],
+    /// Cameras and their lenses.
+    pub cameras: &'a [(&'a str, &'a Intrinsics)],
+    /// Names of the joints, in the order of the readings.
+    pub joint_names: &'a [String],
+}
+
+/// A recording being written.
+///
+/// After an error nothing more can be written; what was written before stays readable. Dropping it finishes the file.
+pub struct Recorder {
+    path: PathBuf,
+    mcap: mcap::Writer<Box<dyn Sink>>,
+    channels: BTreeMap<(Topic, &'static str), u16>,
+    cameras: Vec<(String, Intrinsics)>,
+    joint_names: String,
+    n_messages: u32,
+    flushed: Option<Stamp>,
+}
+
+trait Sink: Write + Seek + Send {}
+impl<W: Write + Seek + Send> Sink for W {}
+
+impl Recorder {
+    /// Begins a recording; an existing file of that name is replaced.
+    pub fn create(path: &Path, about: &About<'_>) -> Result<Self, Error> {
+        let file = File::create(path).map_err(|source| Error::Open { path: path.to_owned(), source })?;
+        Self::to(Box::new(BufWriter::new(file)), path, about)
+    }
+
+    fn to(sink: Box<dyn Sink>, path: &Path, about: &About<'_>) -> Result<Self, Error> {
+        let recorder = |source| Error::Record { path: path.to_owned(), source };
+        let options = mcap::WriteOptions::new()
+            .profile("fieldrig")
+            .compression(None)
+            .chunk_size(Some(CHUNK_BYTES))
+            .disable_seeking(true);
+        let mut mcap = options.create(sink).map_err(recorder)?;
+        for (name, data) in about.files {
+            let attachment = mcap::Attachment {
+                log_time: 0,
+                create_time: 0,
+                name: (*name).to_owned(),
+                media_type: media_type_of(name).to_owned(),
+                data: (*data).into(),
+            };
+            mcap.attach(&attachment).map_err(recorder)?;
+        }
+        mcap.flush().map_err(recorder)?;
+        Ok(Self {
+            path: path.to_owned(),
+            mcap,
+            channels: BTreeMap::new(),
+            cameras: about
+                .cameras
+                .iter()
+                .map(|(name, intrinsics)| ((*name).to_owned(), (*intrinsics).clone()))
+                .collect(),
+            joint_names: about.joint_names.join(","),
+            n_messages: 0,
+            flushed: None,
+        })
+    }
+
+    /// Appends one sample.
+    pub fn write(&mut self, sample: &Sample) -> Result<(), Error> {
+        self.try_write(sample).map_err(|source| Error::Record { path: self.path.clone(), source })
+    }
+
+    /// Writes the index that viewers seek by, and waits until the disk has everything.
+    pub fn finish(mut self) -> Result<(), Error> {
+        let finished = self.mcap.finish().and_then(|_| Ok(self.mcap.into_inner().flush()?));
+        finished.map_err(|source| Error::Record { path: self.path, source })
+    }
+
+    fn try_write(&mut self, sample: &Sample) -> mcap::McapResult<()> {
+        let stamp = sample.stamp();
+        for (camera, intrinsics) in std::mem::take(&mut self.cameras) {
+            let message = foxglove::encode_calibration(&camera, stamp, &intrinsics);
+            self.put(Topic::Calibration(camera), descriptor::CAMERA_CALIBRATION, stamp, &message)?;
+        }
+        match sample {
+            Sample::Image(image) => {
+                let camera = image.camera.to_string();
+                let topic = if image.is_depth() { Topic::Depth(camera) } else { Topic::Color(camera) };
+                self.put_image(topic, image)?;
+            }
+            Sample::Joints(state) => {
+                let channel =
+                    self.channel(Topic::Joints, Encoding::joint_state(), "joint_names", &self.joint_names.clone())?;
+                self.append(channel, stamp, &joint_state::encode(state))?;
+            }
+            Sample::Base(pose) => {
+                let message = foxglove::encode_transform("world", "base", stamp, &pose.world_from_base);
+                self.put(Topic::Base, descriptor::FRAME_TRANSFORM, stamp, &message)?;
+            }
+            Sample::Truth(truth) => self.put_truth(truth)?,
+        }
+        let flushed = *self.flushed.get_or_insert(stamp);
+        if stamp.0.saturating_sub(flushed.0) >= FLUSH_NANOS {
+            self.mcap.flush()?;
+            self.flushed = Some(stamp);
+        }
+        Ok(())
+    }
+
+    fn put_truth(&mut self, truth: &TruthImage) -> mcap::McapResult<()> {
+        let camera = || truth.image.camera.to_string();
+        let stamp = truth.image.stamp;
+        self.put_image(Topic::TrueColor(camera()), &truth.image)?;
+        if !truth.depth_m.is_empty() {
+            let message = foxglove::encode_depth_m(&camera(), stamp, truth.image.size_px, &truth.depth_m);
+            self.put(Topic::TrueDepth(camera()), descriptor::RAW_IMAGE, stamp, &message)?;
+        }
+        let message = foxglove::encode_true_pose(&camera(), stamp, &truth.world_from_camera, truth.psnr_ceiling);
+        self.put(Topic::TruePose(camera()), descriptor::FRAME_TRANSFORM, stamp, &message)
+    }
+
+    fn put_image(&mut self, topic: Topic, image: &Image) -> mcap::McapResult<()> {
+        let encoding = Encoding::protobuf(foxglove::schema_of(image.format));
+        let channel = match image.format {
+            PixelFormat::DepthU16 { metres_per_count } => {
+                self.channel(topic, encoding, "metres_per_count", &metres_per_count.to_string())?
+            }
+            _ => self.channel(topic, encoding, "", "")?,
+        };
+        self.append(channel, image.stamp, &foxglove::encode_image(image))
+    }
+
+    fn put(&mut self, topic: Topic, schema: descriptor::Schema, stamp: Stamp, message: &[u8]) -> mcap::McapResult<()> {
+        let channel = self.channel(topic, Encoding::protobuf(schema), "", "")?;
+        self.append(channel, stamp, message)
+    }
+
+    /// The channel of a topic, announced in the file when it is new; `key` and `value` go into its metadata.
+    fn channel(&mut self, topic: Topic, encoding: Encoding, key: &str, value: &str) -> mcap::McapResult<u16> {
+        let known = (topic, encoding.schema_name);
+        if let Some(channel) = self.channels.get(&known) {
+            return Ok(*channel);
+        }
+        let schema = self.mcap.add_schema(encoding.schema_name, encoding.schema_encoding, &encoding.schema)?;
+        let metadata =
+            if key.is_empty() { BTreeMap::new() } else { BTreeMap::from([(key.to_owned(), value.to_owned())]) };
+        let channel = self.mcap.add_channel(schema, &known.0.name(), encoding.message_encoding, &metadata)?;
+        self.channels.insert(known, channel);
+        Ok(channel)
+    }
+
+    fn append(&mut self, channel_id: u16, stamp: Stamp, message: &[u8]) -> mcap::McapResult<()> {
+        // Viewers sort by this time; the exact stamp, which may lie before zero, is in the message.
+        let log_time = u64::try_from(stamp.0).unwrap_or(0);
+        let header = MessageHeader { channel_id, sequence: self.n_messages, log_time, publish_time: log_time };
+        self.n_messages = self.n_messages.wrapping_add(1);
+        self.mcap.write_to_known_channel(&header, message)
+    }
+}
+
+impl std::fmt::Debug for Recorder {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Recorder")
+            .field("path", &self.path)
+            .field("n_messages", &self.n_messages)
+            .finish_non_exhaustive()
+    }
+}
+
+fn media_type_of(name: &str) -> &'static str {
+    match name.rsplit_once('.').map(|(_, ending)| ending) {
+        Some("toml") => "application/toml",
+        Some("urdf" | "xml") => "application/xml",
+        Some("json") => "application/json",
+        _ => "application/octet-stream",
+    }
+}

@@ -1,0 +1,232 @@
+//! Self-description of the protobuf messages in a recording, so that any MCAP viewer can read them.
+//!
+//! Source: `google/protobuf/descriptor.proto` for the encoding; the Foxglove schemas (docs.foxglove.dev/docs/sdk/schemas)
+//! for names and numbers. Fields from 1001 on are ours and keep what those schemas have no place for.
+
+use super::protobuf::Message;
+
+/// Names and numbers of one message type.
+#[derive(Clone, Copy, Debug)]
+pub struct Schema {
+    /// Package and name, `foxglove.RawImage`.
+    pub name: &'static str,
+    fields: &'static [FieldSpec],
+    needs: &'static [&'static Self],
+}
+
+#[derive(Clone, Copy, Debug)]
+struct FieldSpec {
+    name: &'static str,
+    number: u32,
+    kind: Kind,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Kind {
+    Double,
+    Doubles,
+    Int64,
+    Uint64,
+    Int32,
+    Fixed32,
+    Text,
+    Bytes,
+    Message(&'static str),
+}
+
+const fn field(name: &'static str, number: u32, kind: Kind) -> FieldSpec {
+    FieldSpec { name, number, kind }
+}
+
+const TIMESTAMP: Schema = Schema {
+    name: "google.protobuf.Timestamp",
+    fields: &[field("seconds", 1, Kind::Int64), field("nanos", 2, Kind::Int32)],
+    needs: &[],
+};
+
+const VECTOR3: Schema = Schema {
+    name: "foxglove.Vector3",
+    fields: &[field("x", 1, Kind::Double), field("y", 2, Kind::Double), field("z", 3, Kind::Double)],
+    needs: &[],
+};
+
+const QUATERNION: Schema = Schema {
+    name: "foxglove.Quaternion",
+    fields: &[
+        field("x", 1, Kind::Double),
+        field("y", 2, Kind::Double),
+        field("z", 3, Kind::Double),
+        field("w", 4, Kind::Double),
+    ],
+    needs: &[],
+};
+
+/// A compressed colour image.
+pub const COMPRESSED_IMAGE: Schema = Schema {
+    name: "foxglove.CompressedImage",
+    fields: &[
+        field("timestamp", 1, Kind::Message(".google.protobuf.Timestamp")),
+        field("data", 2, Kind::Bytes),
+        field("format", 3, Kind::Text),
+        field("frame_id", 4, Kind::Text),
+        field("exposure_secs", 1001, Kind::Double),
+        field("n_skipped", 1002, Kind::Uint64),
+        field("width_px", 1003, Kind::Fixed32),
+        field("height_px", 1004, Kind::Fixed32),
+    ],
+    needs: &[&TIMESTAMP],
+};
+
+/// An uncompressed colour or depth image.
+pub const RAW_IMAGE: Schema = Schema {
+    name: "foxglove.RawImage",
+    fields: &[
+        field("timestamp", 1, Kind::Message(".google.protobuf.Timestamp")),
+        field("width", 2, Kind::Fixed32),
+        field("height", 3, Kind::Fixed32),
+        field("encoding", 4, Kind::Text),
+        field("step", 5, Kind::Fixed32),
+        field("data", 6, Kind::Bytes),
+        field("frame_id", 7, Kind::Text),
+        field("exposure_secs", 1001, Kind::Double),
+        field("n_skipped", 1002, Kind::Uint64),
+        field("metres_per_count", 1005, Kind::Double),
+    ],
+    needs: &[&TIMESTAMP],
+};
+
+/// Lens parameters of a camera.
+pub const CAMERA_CALIBRATION: Schema = Schema {
+    name: "foxglove.CameraCalibration",
+    fields: &[
+        field("timestamp", 1, Kind::Message(".google.protobuf.Timestamp")),
+        field("width", 2, Kind::Fixed32),
+        field("height", 3, Kind::Fixed32),
+        field("distortion_model", 4, Kind::Text),
+        field("D", 5, Kind::Doubles),
+        field("K", 6, Kind::Doubles),
+        field("R", 7, Kind::Doubles),
+        field("P", 8, Kind::Doubles),
+        field("frame_id", 9, Kind::Text),
+    ],
+    needs: &[&TIMESTAMP],
+};
+
+/// Pose of one frame in another.
+pub const FRAME_TRANSFORM: Schema = Schema {
+    name: "foxglove.FrameTransform",
+    fields: &[
+        field("timestamp", 1, Kind::Message(".google.protobuf.Timestamp")),
+        field("parent_frame_id", 2, Kind::Text),
+        field("child_frame_id", 3, Kind::Text),
+        field("translation", 4, Kind::Message(".foxglove.Vector3")),
+        field("rotation", 5, Kind::Message(".foxglove.Quaternion")),
+        field("psnr_ceiling", 1006, Kind::Double),
+    ],
+    needs: &[&TIMESTAMP, &VECTOR3, &QUATERNION],
+};
+
+impl Schema {
+    /// The encoded `FileDescriptorSet`: this message's file after the files it needs.
+    pub fn file_descriptor_set(&self) -> Vec<u8> {
+        let mut set = Message::default();
+        for needed in self.needs {
+            set.message(1, &needed.file());
+        }
+        set.message(1, &self.file());
+        set.into_bytes()
+    }
+
+    /// One `FileDescriptorProto` with one message in it.
+    fn file(&self) -> Message {
+        let (package, name) = self.name.rsplit_once('.').unwrap_or(("", self.name));
+        let mut message = Message::default();
+        message.bytes(1, name.as_bytes());
+        for field in self.fields {
+            message.message(2, &field.encode());
+        }
+        let mut file = Message::default();
+        file.bytes(1, self.path().as_bytes()).bytes(2, package.as_bytes());
+        for needed in self.needs {
+            file.bytes(3, needed.path().as_bytes());
+        }
+        file.message(4, &message).bytes(12, b"proto3");
+        file
+    }
+
+    /// Path of the `.proto` file, as other files import it.
+    fn path(&self) -> String {
+        if self.name == TIMESTAMP.name {
+            "google/protobuf/timestamp.proto".into()
+        } else {
+            format!("{}.proto", self.name.replace('.', "/"))
+        }
+    }
+}
+
+impl FieldSpec {
+    /// The field as a `FieldDescriptorProto`.
+    fn encode(&self) -> Message {
+        const OPTIONAL: u64 = 1;
+        const REPEATED: u64 = 3;
+        let (label, type_number, type_name) = match self.kind {
+            Kind::Double => (OPTIONAL, 1, None),
+            Kind::Doubles => (REPEATED, 1, None),
+            Kind::Int64 => (OPTIONAL, 3, None),
+            Kind::Uint64 => (OPTIONAL, 4, None),
+            Kind::Int32 => (OPTIONAL, 5, None),
+            Kind::Fixed32 => (OPTIONAL, 7, None),
+            Kind::Text => (OPTIONAL, 9, None),
+            Kind::Message(name) => (OPTIONAL, 11, Some(name)),
+            Kind::Bytes => (OPTIONAL, 12, None),
+        };
+        let mut encoded = Message::default();
+        encoded
+            .bytes(1, self.name.as_bytes())
+            .varint(3, u64::from(self.number))
+            .varint(4, label)
+            .varint(5, type_number);
+        if let Some(name) = type_name {
+            encoded.bytes(6, name.as_bytes());
+        }
+        encoded
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::wire::protobuf::fields;
+
+    #[test]
+    fn a_set_lists_every_file_before_the_one_that_needs_it() {
+        let set = FRAME_TRANSFORM.file_descriptor_set();
+        let paths: Vec<String> = fields(&set)
+            .map(|file| {
+                let file = file.expect("own bytes").bytes().expect("a message");
+                let path = fields(file).next().expect("a name").expect("own bytes");
+                path.text().expect("text").to_owned()
+            })
+            .collect();
+        assert_eq!(
+            paths,
+            [
+                "google/protobuf/timestamp.proto",
+                "foxglove/Vector3.proto",
+                "foxglove/Quaternion.proto",
+                "foxglove/FrameTransform.proto"
+            ]
+        );
+    }
+
+    #[test]
+    fn field_numbers_are_unique() {
+        for schema in [TIMESTAMP, VECTOR3, QUATERNION, COMPRESSED_IMAGE, RAW_IMAGE, CAMERA_CALIBRATION, FRAME_TRANSFORM]
+        {
+            let mut numbers: Vec<_> = schema.fields.iter().map(|field| field.number).collect();
+            numbers.sort_unstable();
+            numbers.dedup();
+            assert_eq!(numbers.len(), schema.fields.len(), "{}", schema.name);
+        }
+    }
+}

@@ -1,0 +1,308 @@
+//! Foxglove's messages for images, lenses and poses.
+//!
+//! Colour keeps the device's own bytes and depth its raw counts; stamps are exact to the nanosecond, numbers to the bit.
+//! Field numbers are those of [`super::descriptor`].
+
+use super::protobuf::{Field, Message, fields};
+use super::{Malformed, descriptor};
+use crate::{Image, PixelFormat};
+use kinematics::{Intrinsics, Lens, Stamp, Transform};
+use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+use std::sync::Arc;
+
+const EXPOSURE_SECS: u32 = 1001;
+const N_SKIPPED: u32 = 1002;
+const WIDTH_PX: u32 = 1003;
+const HEIGHT_PX: u32 = 1004;
+const METRES_PER_COUNT: u32 = 1005;
+const PSNR_CEILING: u32 = 1006;
+const NANOS_PER_SEC: i64 = 1_000_000_000;
+
+/// Which message carries images of this format.
+pub fn schema_of(format: PixelFormat) -> descriptor::Schema {
+    match format {
+        PixelFormat::Jpeg | PixelFormat::Png => descriptor::COMPRESSED_IMAGE,
+        PixelFormat::Rgb8 | PixelFormat::Gray8 | PixelFormat::DepthU16 { .. } => descriptor::RAW_IMAGE,
+    }
+}
+
+/// An image as `CompressedImage` or `RawImage`, see [`schema_of`].
+pub fn encode_image(image: &Image) -> Vec<u8> {
+    let mut message = Message::with_capacity(image.data.len() + 256);
+    message.message(1, &timestamp(image.stamp));
+    match image.format {
+        PixelFormat::Jpeg | PixelFormat::Png => {
+            let format: &[u8] = if image.format == PixelFormat::Jpeg { b"jpeg" } else { b"png" };
+            message.bytes(2, &image.data).bytes(3, format).bytes(4, image.camera.as_bytes());
+            message.fixed32(WIDTH_PX, image.size_px[0]).fixed32(HEIGHT_PX, image.size_px[1]);
+        }
+        PixelFormat::Rgb8 => raw_image(&mut message, image, "rgb8", 3),
+        PixelFormat::Gray8 => raw_image(&mut message, image, "mono8", 1),
+        PixelFormat::DepthU16 { metres_per_count } => {
+            raw_image(&mut message, image, "16UC1", 2);
+            message.double(METRES_PER_COUNT, metres_per_count);
+        }
+    }
+    if let Some(exposure_secs) = image.exposure_secs {
+        message.double(EXPOSURE_SECS, exposure_secs);
+    }
+    message.varint(N_SKIPPED, image.n_skipped);
+    message.into_bytes()
+}
+
+fn raw_image(message: &mut Message, image: &Image, encoding: &str, bytes_per_pixel: u32) {
+    message.fixed32(2, image.size_px[0]).fixed32(3, image.size_px[1]).bytes(4, encoding.as_bytes());
+    message
+        .fixed32(5, image.size_px[0].saturating_mul(bytes_per_pixel))
+        .bytes(6, &image.data)
+        .bytes(7, image.camera.as_bytes());
+}
+
+/// An image from the message that [`schema_of`] names.
+pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
+    let compressed = schema == descriptor::COMPRESSED_IMAGE.name;
+    let mut stamp = None;
+    let mut size_px = [0; 2];
+    let mut format = "";
+    let mut metres_per_count = None;
+    let mut image = Image {
+        camera: Arc::from(""),
+        stamp: Stamp::default(),
+        size_px,
+        format: PixelFormat::Rgb8,
+        data: Arc::from([]),
+        exposure_secs: None,
+        n_skipped: 0,
+    };
+    for field in fields(bytes) {
+        let field = field?;
+        match (field.number, compressed) {
+            (1, _) => stamp = Some(stamp_from(&field)?),
+            (2, true) | (6, false) => image.data = field.bytes()?.into(),
+            (3, true) | (4, false) => format = field.text()?,
+            (4, true) | (7, false) => image.camera = field.text()?.into(),
+            (WIDTH_PX, true) | (2, false) => size_px[0] = field.fixed32()?,
+            (HEIGHT_PX, true) | (3, false) => size_px[1] = field.fixed32()?,
+            (EXPOSURE_SECS, _) => image.exposure_secs = Some(field.double()?),
+            (N_SKIPPED, _) => image.n_skipped = field.varint()?,
+            (METRES_PER_COUNT, false) => metres_per_count = Some(field.double()?),
+            _ => {} // A newer writer may know more.
+        }
+    }
+    image.stamp = stamp.ok_or(Malformed::Missing { name: "timestamp" })?;
+    image.size_px = size_px;
+    image.format = match (format, compressed) {
+        ("jpeg", true) => PixelFormat::Jpeg,
+        ("png", true) => PixelFormat::Png,
+        ("rgb8", false) => PixelFormat::Rgb8,
+        ("mono8", false) => PixelFormat::Gray8,
+        ("16UC1", false) => PixelFormat::DepthU16 {
+            metres_per_count: metres_per_count.ok_or(Malformed::Missing { name: "metres_per_count" })?,
+        },
+        _ => return Err(Malformed::PixelFormat { name: format.to_owned() }),
+    };
+    Ok(image)
+}
+
+/// Depth in metres as a `RawImage` of 32-bit floats.
+pub fn encode_depth_m(camera: &str, stamp: Stamp, size_px: [u32; 2], depth_m: &[f32]) -> Vec<u8> {
+    let mut message = Message::with_capacity(depth_m.len() * 4 + 256);
+    let data: Vec<u8> = depth_m.iter().flat_map(|depth_m| depth_m.to_le_bytes()).collect();
+    message.message(1, &timestamp(stamp)).fixed32(2, size_px[0]).fixed32(3, size_px[1]).bytes(4, b"32FC1");
+    message.fixed32(5, size_px[0].saturating_mul(4)).bytes(6, &data).bytes(7, camera.as_bytes());
+    message.into_bytes()
+}
+
+/// The metres that [`encode_depth_m`] wrote.
+pub fn decode_depth_m(bytes: &[u8]) -> Result<Arc<[f32]>, Malformed> {
+    for field in fields(bytes) {
+        let field = field?;
+        if field.number == 6 {
+            let metres = |bytes: &[u8]| f32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]);
+            return Ok(field.bytes()?.chunks_exact(4).map(metres).collect());
+        }
+    }
+    Err(Malformed::Missing { name: "data" })
+}
+
+/// Lens parameters as a `CameraCalibration`.
+pub fn encode_calibration(camera: &str, stamp: Stamp, intrinsics: &Intrinsics) -> Vec<u8> {
+    let [fx, fy] = intrinsics.focal_px;
+    let [cx, cy] = intrinsics.principal_px;
+    let (model, distortion): (&str, &[f64]) = match &intrinsics.lens {
+        _ if intrinsics.rectified => ("", &[]),
+        Lens::Pinhole => ("", &[]),
+        Lens::BrownConrady(k) => ("plumb_bob", k),
+        Lens::KannalaBrandt(k) => ("kannala_brandt", k),
+    };
+    let mut message = Message::default();
+    message.message(1, &timestamp(stamp)).fixed32(2, intrinsics.size_px[0]).fixed32(3, intrinsics.size_px[1]);
+    message.bytes(4, model.as_bytes()).doubles(5, distortion);
+    message.doubles(6, &[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]);
+    message.doubles(7, &[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
+    message.doubles(8, &[fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]);
+    message.bytes(9, camera.as_bytes());
+    message.into_bytes()
+}
+
+/// A pose as a `FrameTransform`.
+pub fn encode_transform(parent: &str, child: &str, stamp: Stamp, parent_from_child: &Transform) -> Vec<u8> {
+    let [x, y, z] = parent_from_child.translation.vector.into();
+    let mut translation = Message::default();
+    translation.double(1, x).double(2, y).double(3, z);
+    let quaternion = parent_from_child.rotation.quaternion();
+    let mut rotation = Message::default();
+    rotation.double(1, quaternion.i).double(2, quaternion.j).double(3, quaternion.k).double(4, quaternion.w);
+    let mut message = Message::default();
+    message.message(1, &timestamp(stamp)).bytes(2, parent.as_bytes()).bytes(3, child.as_bytes());
+    message.message(4, &translation).message(5, &rotation);
+    message.into_bytes()
+}
+
+/// Stamp and pose from a `FrameTransform`, bit for bit as they were encoded.
+pub fn decode_transform(bytes: &[u8]) -> Result<(Stamp, Transform), Malformed> {
+    let mut stamp = None;
+    let mut translation = None;
+    let mut rotation = None;
+    for field in fields(bytes) {
+        let field = field?;
+        match field.number {
+            1 => stamp = Some(stamp_from(&field)?),
+            4 => translation = Some(numbers::<3>(&field)?),
+            5 => rotation = Some(numbers::<4>(&field)?),
+            _ => {}
+        }
+    }
+    let [x, y, z] = translation.ok_or(Malformed::Missing { name: "translation" })?;
+    let [i, j, k, w] = rotation.ok_or(Malformed::Missing { name: "rotation" })?;
+    // Not normalised again: that would change the last bit.
+    let rotation = UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k));
+    let stamp = stamp.ok_or(Malformed::Missing { name: "timestamp" })?;
+    Ok((stamp, Transform::from_parts(Translation3::new(x, y, z), rotation)))
+}
+
+/// A true camera pose in the world, with the PSNR that noise leaves possible, dB.
+pub fn encode_true_pose(
+    camera: &str,
+    stamp: Stamp,
+    world_from_camera: &Transform,
+    psnr_ceiling: Option<f64>,
+) -> Vec<u8> {
+    let mut bytes = encode_transform("world", camera, stamp, world_from_camera);
+    if let Some(psnr_ceiling) = psnr_ceiling {
+        // Fields of a message may come in any order, so the encoded parts can simply follow each other.
+        let mut ceiling = Message::default();
+        ceiling.double(PSNR_CEILING, psnr_ceiling);
+        bytes.extend(ceiling.into_bytes());
+    }
+    bytes
+}
+
+/// Pose and ceiling that [`encode_true_pose`] wrote.
+pub fn decode_true_pose(bytes: &[u8]) -> Result<(Transform, Option<f64>), Malformed> {
+    let (_, world_from_camera) = decode_transform(bytes)?;
+    for field in fields(bytes) {
+        let field = field?;
+        if field.number == PSNR_CEILING {
+            return Ok((world_from_camera, Some(field.double()?)));
+        }
+    }
+    Ok((world_from_camera, None))
+}
+
+/// The doubles 1 to `N` of a message that holds nothing else; absent ones are zero.
+fn numbers<const N: usize>(field: &Field<'_>) -> Result<[f64; N], Malformed> {
+    let mut numbers = [0.0; N];
+    for inner in fields(field.bytes()?) {
+        let inner = inner?;
+        let slot = (inner.number as usize).checked_sub(1).and_then(|ix| numbers.get_mut(ix));
+        *slot.ok_or(Malformed::Range { field: inner.number })? = inner.double()?;
+    }
+    Ok(numbers)
+}
+
+fn timestamp(stamp: Stamp) -> Message {
+    let mut message = Message::default();
+    message.varint(1, stamp.0.div_euclid(NANOS_PER_SEC).cast_unsigned());
+    message.varint(2, stamp.0.rem_euclid(NANOS_PER_SEC).cast_unsigned());
+    message
+}
+
+fn stamp_from(field: &Field<'_>) -> Result<Stamp, Malformed> {
+    let mut secs = 0_i64;
+    let mut nanos = 0_i64;
+    for inner in fields(field.bytes()?) {
+        let inner = inner?;
+        match inner.number {
+            1 => secs = inner.varint()?.cast_signed(),
+            2 => nanos = inner.varint()?.cast_signed(),
+            _ => {}
+        }
+    }
+    secs.checked_mul(NANOS_PER_SEC)
+        .and_then(|whole| whole.checked_add(nanos))
+        .map(Stamp)
+        .ok_or(Malformed::Range { field: field.number })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn image(format: PixelFormat) -> Image {
+        Image {
+            camera: "wrist".into(),
+            stamp: Stamp(1_234_567_890_123_456_789),
+            size_px: [3, 2],
+            format,
+            data: (0..12).collect(),
+            exposure_secs: Some(0.004),
+            n_skipped: 3,
+        }
+    }
+
+    #[test]
+    fn images_come_back_bit_for_bit_in_every_format() {
+        let depth = PixelFormat::DepthU16 { metres_per_count: 0.1 + 0.2 };
+        for format in [PixelFormat::Rgb8, PixelFormat::Gray8, PixelFormat::Jpeg, PixelFormat::Png, depth] {
+            for exposure_secs in [Some(0.0), None] {
+                for stamp in [Stamp(0), Stamp(-1), Stamp(i64::MAX), Stamp(-1_500_000_000), Stamp(999_999_999)] {
+                    let sent = Image { exposure_secs, stamp, ..image(format) };
+                    assert_eq!(decode_image(schema_of(format).name, &encode_image(&sent)), Ok(sent));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn poses_come_back_bit_for_bit() {
+        let pose = Transform::from_parts(
+            Translation3::new(0.1, -0.0, 1e-300),
+            UnitQuaternion::from_euler_angles(0.3, -0.7, 2.9),
+        );
+        let (stamp, read) = decode_transform(&encode_transform("world", "base", Stamp(5), &pose)).expect("own bytes");
+        assert_eq!(stamp, Stamp(5));
+        let bits = |pose: &Transform| {
+            let rotation = pose.rotation.coords.iter().map(|number| number.to_bits());
+            pose.translation.vector.iter().map(|number| number.to_bits()).chain(rotation).collect::<Vec<_>>()
+        };
+        assert_eq!(bits(&read), bits(&pose));
+    }
+
+    #[test]
+    fn metres_come_back_bit_for_bit() {
+        let depth_m = [0.0, 1.25, f32::NAN, f32::MIN_POSITIVE];
+        let read = decode_depth_m(&encode_depth_m("wrist", Stamp(1), [2, 2], &depth_m)).expect("own bytes");
+        assert!(read.iter().zip(depth_m).all(|(read, sent)| read.to_bits() == sent.to_bits()) && read.len() == 4);
+    }
+
+    #[test]
+    fn what_is_missing_or_unknown_is_named() {
+        assert_eq!(decode_image("foxglove.RawImage", &[]), Err(Malformed::Missing { name: "timestamp" }));
+        let jpeg_as_raw = decode_image("foxglove.RawImage", &encode_image(&image(PixelFormat::Jpeg)));
+        assert!(jpeg_as_raw.is_err(), "{jpeg_as_raw:?}");
+        let cut = &encode_image(&image(PixelFormat::Rgb8))[..30];
+        assert_eq!(decode_image("foxglove.RawImage", cut), Err(Malformed::CutOff));
+        assert!(decode_transform(&[]).is_err());
+    }
+}

@@ -1,0 +1,108 @@
+//! Joint readings as JSON with a schema of their own, since Foxglove has none that every version of its viewer opens.
+
+use super::Malformed;
+use kinematics::{JointState, Stamp};
+use serde::{Deserialize, Serialize};
+
+/// Name of the schema.
+pub const SCHEMA_NAME: &str = "fieldrig.JointState";
+
+/// The JSON schema of the messages.
+pub const SCHEMA: &str = r#"{
+  "$schema": "https://json-schema.org/draft/2020-12/schema",
+  "title": "fieldrig.JointState",
+  "description": "Readings of the joints of one arm at one instant, in the order of the joint names in the channel's metadata",
+  "type": "object",
+  "properties": {
+    "timestamp": {
+      "type": "object",
+      "properties": { "sec": { "type": "integer" }, "nsec": { "type": "integer" } }
+    },
+    "position": { "type": "array", "items": { "type": "number" }, "description": "radians or metres; null: not a number" },
+    "velocity": { "type": "array", "items": { "type": "number" }, "description": "radians or metres per second; empty: not told" },
+    "effort": { "type": "array", "items": { "type": "number" }, "description": "newton metres or newtons; empty: not told" }
+  }
+}"#;
+
+#[derive(Serialize, Deserialize)]
+struct Wire {
+    timestamp: Timestamp,
+    position: Vec<Option<f64>>,
+    velocity: Vec<Option<f64>>,
+    effort: Vec<Option<f64>>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Timestamp {
+    sec: i64,
+    nsec: u32,
+}
+
+const NANOS_PER_SEC: i64 = 1_000_000_000;
+
+/// Joint readings as JSON; every finite number comes back to the bit, others as NaN.
+pub fn encode(state: &JointState) -> Vec<u8> {
+    let finite = |numbers: &[f64]| numbers.iter().map(|number| number.is_finite().then_some(*number)).collect();
+    let nsec = u32::try_from(state.stamp.0.rem_euclid(NANOS_PER_SEC)).expect("below a thousand million");
+    let wire = Wire {
+        timestamp: Timestamp { sec: state.stamp.0.div_euclid(NANOS_PER_SEC), nsec },
+        position: finite(&state.position),
+        velocity: finite(&state.velocity),
+        effort: finite(&state.effort),
+    };
+    serde_json::to_vec(&wire).expect("numbers and lists always serialize")
+}
+
+/// The joint readings that [`encode`] wrote.
+pub fn decode(bytes: &[u8]) -> Result<JointState, Malformed> {
+    let wire: Wire = serde_json::from_slice(bytes).map_err(|e| Malformed::Json { reason: e.to_string() })?;
+    let stamp = wire
+        .timestamp
+        .sec
+        .checked_mul(NANOS_PER_SEC)
+        .and_then(|whole| whole.checked_add(i64::from(wire.timestamp.nsec)));
+    let numbers = |read: Vec<Option<f64>>| read.into_iter().map(|number| number.unwrap_or(f64::NAN)).collect();
+    Ok(JointState {
+        stamp: stamp.map(Stamp).ok_or_else(|| Malformed::Json { reason: "the timestamp is out of range".into() })?,
+        position: numbers(wire.position),
+        velocity: numbers(wire.velocity),
+        effort: numbers(wire.effort),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn readings_come_back_bit_for_bit() {
+        let mut number = 0.1_f64;
+        for stamp in [0, -1, 1_700_000_000_123_456_789, i64::MAX] {
+            let position: Vec<f64> = (0..7)
+                .map(|_| {
+                    number = (number * 1103.5 + 0.123).fract() * 3.0 - 1.5;
+                    number
+                })
+                .collect();
+            let sent =
+                JointState { stamp: Stamp(stamp), velocity: vec![-0.0, f64::MIN_POSITIVE], position, effort: vec![] };
+            let read = decode(&encode(&sent)).expect("own bytes");
+            assert_eq!(read, sent);
+            assert!(read.velocity[0].is_sign_negative());
+        }
+    }
+
+    #[test]
+    fn what_is_no_number_stays_no_number() {
+        let sent = JointState { stamp: Stamp(1), position: vec![f64::NAN, 1.0], velocity: vec![], effort: vec![] };
+        let read = decode(&encode(&sent)).expect("own bytes");
+        assert!(read.position[0].is_nan() && read.position[1] == 1.0);
+    }
+
+    #[test]
+    fn broken_json_is_told_and_the_schema_is_json() {
+        assert!(decode(b"{\"timestamp\":").is_err());
+        assert!(decode(b"{}").expect_err("empty").to_string().contains("timestamp"));
+        serde_json::from_str::<serde_json::Value>(SCHEMA).expect("valid JSON");
+    }
+}

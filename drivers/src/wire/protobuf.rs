@@ -1,0 +1,262 @@
+//! The protobuf wire format: fields in, fields out.
+//!
+//! Source: Protocol Buffers documentation, "Encoding". Groups do not exist in proto3 and are refused.
+
+use super::Malformed;
+
+const VARINT: u8 = 0;
+const FIXED64: u8 = 1;
+const LENGTH: u8 = 2;
+const FIXED32: u8 = 5;
+
+/// Appends fields to a message.
+#[derive(Clone, Debug, Default)]
+pub struct Message(Vec<u8>);
+
+impl Message {
+    /// An empty message with room for `bytes`.
+    pub fn with_capacity(bytes: usize) -> Self {
+        Self(Vec::with_capacity(bytes))
+    }
+
+    /// An integer; negative numbers of `int32` and `int64` as their 64-bit two's complement.
+    pub fn varint(&mut self, field: u32, value: u64) -> &mut Self {
+        self.key(field, VARINT);
+        self.raw_varint(value);
+        self
+    }
+
+    /// A `fixed32`.
+    pub fn fixed32(&mut self, field: u32, value: u32) -> &mut Self {
+        self.key(field, FIXED32);
+        self.0.extend(value.to_le_bytes());
+        self
+    }
+
+    /// A `double`, bit for bit.
+    pub fn double(&mut self, field: u32, value: f64) -> &mut Self {
+        self.key(field, FIXED64);
+        self.0.extend(value.to_le_bytes());
+        self
+    }
+
+    /// `repeated double`, packed.
+    pub fn doubles(&mut self, field: u32, values: &[f64]) -> &mut Self {
+        self.key(field, LENGTH);
+        self.raw_varint(values.len() as u64 * 8);
+        self.0.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+        self
+    }
+
+    /// `bytes`, `string` or a finished message.
+    pub fn bytes(&mut self, field: u32, value: &[u8]) -> &mut Self {
+        self.key(field, LENGTH);
+        self.raw_varint(value.len() as u64);
+        self.0.extend_from_slice(value);
+        self
+    }
+
+    /// A message inside this one.
+    pub fn message(&mut self, field: u32, inner: &Self) -> &mut Self {
+        self.bytes(field, &inner.0)
+    }
+
+    /// The encoded bytes.
+    pub fn into_bytes(self) -> Vec<u8> {
+        self.0
+    }
+
+    fn key(&mut self, field: u32, wire_type: u8) {
+        self.raw_varint(u64::from(field) << 3 | u64::from(wire_type));
+    }
+
+    fn raw_varint(&mut self, mut value: u64) {
+        while value >= 0x80 {
+            self.0.push(value.to_le_bytes()[0] | 0x80);
+            value >>= 7;
+        }
+        self.0.push(value.to_le_bytes()[0]);
+    }
+}
+
+/// One decoded field.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Field<'a> {
+    /// Number of the field.
+    pub number: u32,
+    /// What it holds.
+    pub value: Value<'a>,
+}
+
+/// What a field holds on the wire.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Value<'a> {
+    /// An integer.
+    Varint(u64),
+    /// Eight bytes.
+    Fixed64(u64),
+    /// Four bytes.
+    Fixed32(u32),
+    /// Bytes, text, a message or packed numbers.
+    Length(&'a [u8]),
+}
+
+impl<'a> Field<'a> {
+    /// The value as an integer.
+    pub fn varint(&self) -> Result<u64, Malformed> {
+        match self.value {
+            Value::Varint(value) => Ok(value),
+            _ => Err(self.wrong_type()),
+        }
+    }
+
+    /// The value as a `fixed32`.
+    pub fn fixed32(&self) -> Result<u32, Malformed> {
+        match self.value {
+            Value::Fixed32(value) => Ok(value),
+            _ => Err(self.wrong_type()),
+        }
+    }
+
+    /// The value as a `double`, bit for bit.
+    pub fn double(&self) -> Result<f64, Malformed> {
+        match self.value {
+            Value::Fixed64(bits) => Ok(f64::from_bits(bits)),
+            _ => Err(self.wrong_type()),
+        }
+    }
+
+    /// The value as bytes.
+    pub fn bytes(&self) -> Result<&'a [u8], Malformed> {
+        match self.value {
+            Value::Length(bytes) => Ok(bytes),
+            _ => Err(self.wrong_type()),
+        }
+    }
+
+    /// The value as text.
+    pub fn text(&self) -> Result<&'a str, Malformed> {
+        std::str::from_utf8(self.bytes()?).map_err(|_| Malformed::Text { field: self.number })
+    }
+
+    fn wrong_type(&self) -> Malformed {
+        let wire_type = match self.value {
+            Value::Varint(_) => VARINT,
+            Value::Fixed64(_) => FIXED64,
+            Value::Fixed32(_) => FIXED32,
+            Value::Length(_) => LENGTH,
+        };
+        Malformed::WireType { field: self.number, wire_type }
+    }
+}
+
+/// Walks the fields of a message; ends after the first error.
+#[derive(Clone, Debug)]
+pub struct Fields<'a>(&'a [u8]);
+
+/// The fields of an encoded message, in its order.
+pub fn fields(message: &[u8]) -> Fields<'_> {
+    Fields(message)
+}
+
+impl<'a> Iterator for Fields<'a> {
+    type Item = Result<Field<'a>, Malformed>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.0.is_empty() {
+            return None;
+        }
+        let field = self.field();
+        if field.is_err() {
+            self.0 = &[];
+        }
+        Some(field)
+    }
+}
+
+impl<'a> Fields<'a> {
+    fn field(&mut self) -> Result<Field<'a>, Malformed> {
+        let key = self.varint()?;
+        let number = u32::try_from(key >> 3).map_err(|_| Malformed::Range { field: u32::MAX })?;
+        let wire_type = key.to_le_bytes()[0] & 7;
+        let value = match wire_type {
+            VARINT => Value::Varint(self.varint()?),
+            FIXED64 => Value::Fixed64(u64::from_le_bytes(self.array()?)),
+            FIXED32 => Value::Fixed32(u32::from_le_bytes(self.array()?)),
+            LENGTH => {
+                let n_bytes = usize::try_from(self.varint()?).map_err(|_| Malformed::Range { field: number })?;
+                Value::Length(self.take(n_bytes)?)
+            }
+            _ => return Err(Malformed::WireType { field: number, wire_type }),
+        };
+        Ok(Field { number, value })
+    }
+
+    fn varint(&mut self) -> Result<u64, Malformed> {
+        let mut value = 0;
+        for shift in (0..64).step_by(7) {
+            let [byte] = self.array()?;
+            value |= u64::from(byte & 0x7f) << shift;
+            if byte < 0x80 {
+                return Ok(value);
+            }
+        }
+        Err(Malformed::CutOff)
+    }
+
+    fn take(&mut self, n_bytes: usize) -> Result<&'a [u8], Malformed> {
+        let (taken, rest) = self.0.split_at_checked(n_bytes).ok_or(Malformed::CutOff)?;
+        self.0 = rest;
+        Ok(taken)
+    }
+
+    fn array<const N: usize>(&mut self) -> Result<[u8; N], Malformed> {
+        let (taken, rest) = self.0.split_first_chunk().ok_or(Malformed::CutOff)?;
+        self.0 = rest;
+        Ok(*taken)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_documented_examples_encode_to_their_bytes() {
+        // Protocol Buffers documentation: field 1 = 150; field 2 = "testing"; field 3 holds the first message.
+        let mut inner = Message::default();
+        inner.varint(1, 150);
+        let mut outer = Message::default();
+        outer.bytes(2, b"testing").message(3, &inner);
+        assert_eq!(inner.into_bytes(), [0x08, 0x96, 0x01]);
+        assert_eq!(outer.into_bytes(), b"\x12\x07testing\x1a\x03\x08\x96\x01");
+    }
+
+    #[test]
+    fn fields_come_back_as_they_went_in() {
+        let mut message = Message::default();
+        message.varint(1, u64::MAX).fixed32(2, 7).double(16, -0.0).doubles(1005, &[1.5, f64::MIN_POSITIVE]);
+        let bytes = message.into_bytes();
+        let read: Vec<_> = fields(&bytes).map(|field| field.expect("own bytes")).collect();
+        assert_eq!(read.iter().map(|field| field.number).collect::<Vec<_>>(), [1, 2, 16, 1005]);
+        assert_eq!(read[0].varint(), Ok(u64::MAX));
+        assert_eq!(read[1].fixed32(), Ok(7));
+        assert_eq!(read[2].double().map(f64::to_bits), Ok((-0.0_f64).to_bits()));
+        assert_eq!(read[3].bytes().map(<[u8]>::len), Ok(16));
+        assert_eq!(read[1].varint(), Err(Malformed::WireType { field: 2, wire_type: FIXED32 }));
+    }
+
+    #[test]
+    fn every_cut_is_noticed() {
+        let mut message = Message::default();
+        message.bytes(2, b"testing").double(3, 1.0).varint(4, 1 << 40);
+        let bytes = message.into_bytes();
+        let whole = [9, 18, bytes.len()]; // Ends of the three fields: a cut there leaves a valid shorter message.
+        for n_bytes in 1..bytes.len() {
+            let cut = fields(&bytes[..n_bytes]).any(|field| field.is_err());
+            assert_eq!(cut, !whole.contains(&n_bytes), "cut after {n_bytes} bytes");
+        }
+        assert!(fields(&[0xff; 11]).all(|field| field.is_err()));
+        assert!(fields(&[0x0b]).all(|field| field == Err(Malformed::WireType { field: 1, wire_type: 3 })));
+    }
+}

@@ -1,0 +1,195 @@
+//! Samples to a file and back: nothing changes, nothing is reordered, and a damaged file gives what is left of it.
+
+use drivers::recording::{About, RIG_FILE, Recorder, Recording};
+use drivers::{BasePose, Error, Image, PixelFormat, Sample, Source, TruthImage};
+use kinematics::{Intrinsics, JointState, Lens, Stamp, Transform};
+use nalgebra::{Translation3, UnitQuaternion};
+use std::path::Path;
+
+const RIG: &str = "[arm]\ndriver = \"sim\"\n";
+
+/// Two seconds of a rig: joints at 100 Hz, colour and depth at 10 Hz with truth, some base poses.
+fn samples() -> Vec<Sample> {
+    let mut samples = Vec::new();
+    for tick in 0..200_i32 {
+        let stamp = Stamp(1_000_000_007 + i64::from(tick) * 10_000_000);
+        let angle = f64::from(tick) * 0.013;
+        samples.push(Sample::Joints(JointState {
+            stamp,
+            position: (1..8).map(|joint| (angle * f64::from(joint)).sin()).collect(),
+            velocity: vec![angle.cos(); 7],
+            effort: vec![],
+        }));
+        if tick % 10 == 5 {
+            let stamp = Stamp(stamp.0 - 3_333_333);
+            let world_from_camera = Transform::from_parts(
+                Translation3::new(angle, 0.1, -0.7),
+                UnitQuaternion::from_euler_angles(angle, 0.2, 0.3),
+            );
+            let color = Image {
+                camera: "wrist".into(),
+                stamp,
+                size_px: [16, 12],
+                format: if tick % 20 == 5 { PixelFormat::Rgb8 } else { PixelFormat::Png },
+                data: noise(tick, 16 * 12 * 3).into(),
+                exposure_secs: (tick % 30 == 5).then_some(1e-3),
+                n_skipped: u64::from(tick == 55),
+            };
+            let format = PixelFormat::DepthU16 { metres_per_count: 1e-4 };
+            let depth =
+                Image { stamp: Stamp(stamp.0 + 777), format, data: noise(tick, 16 * 12 * 2).into(), ..color.clone() };
+            let depth_m =
+                if tick < 100 { (0..16 * 12_u16).map(|count| f32::from(count) * 0.37).collect() } else { vec![] };
+            let image = Image { exposure_secs: None, ..color.clone() };
+            let psnr_ceiling = (tick < 50).then_some(42.0 + angle);
+            let truth = TruthImage { image, depth_m: depth_m.into(), world_from_camera, psnr_ceiling };
+            samples.extend([Sample::Image(color), Sample::Truth(truth), Sample::Image(depth)]);
+            samples.push(Sample::Base(BasePose { stamp, world_from_base: world_from_camera.inverse() }));
+        }
+    }
+    samples
+}
+
+fn noise(seed: i32, n_bytes: usize) -> Vec<u8> {
+    let mut state = 12345 + u32::try_from(seed).expect("not negative");
+    let mut byte = || {
+        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        state.to_be_bytes()[0]
+    };
+    (0..n_bytes).map(|_| byte()).collect()
+}
+
+fn record(path: &Path, samples: &[Sample]) {
+    let intrinsics = Intrinsics {
+        size_px: [16, 12],
+        focal_px: [20.0, 21.0],
+        principal_px: [8.0, 6.5],
+        lens: Lens::BrownConrady([0.1, 0.2, 0.3, 0.4, 0.5]),
+        rectified: false,
+    };
+    let about = About {
+        files: &[(RIG_FILE, RIG.as_bytes())],
+        cameras: &[("wrist", &intrinsics)],
+        joint_names: &["a".into(), "b".into()],
+    };
+    let mut recorder = Recorder::create(path, &about).expect("a new file");
+    for sample in samples {
+        recorder.write(sample).expect("room on the disk");
+    }
+    recorder.finish().expect("room on the disk");
+}
+
+fn replay(path: &Path) -> (Vec<Sample>, Recording) {
+    let mut recording = Recording::open(path).expect("a recording");
+    let mut samples = Vec::new();
+    while let Some(sample) = recording.next_sample().expect("readable") {
+        samples.push(sample);
+    }
+    (samples, recording)
+}
+
+#[test]
+fn a_replay_is_what_was_recorded_in_the_same_order() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    let sent = samples();
+    record(&path, &sent);
+    let (read, recording) = replay(&path);
+    assert_eq!(read.len(), sent.len());
+    for (ix, (read, sent)) in read.iter().zip(&sent).enumerate() {
+        assert_eq!(read, sent, "sample {ix}");
+    }
+    assert_eq!(recording.damage(), None);
+    assert_eq!(recording.attachment(RIG_FILE), Some(RIG.as_bytes()));
+    let again = folder.path().join("again.mcap");
+    record(&again, &read);
+    assert!(
+        std::fs::read(&path).expect("first") == std::fs::read(&again).expect("second"),
+        "a replay records to the same bytes"
+    );
+}
+
+#[test]
+fn a_recording_cut_off_anywhere_gives_the_samples_before_the_cut() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    let sent = samples();
+    record(&path, &sent);
+    let whole = std::fs::read(&path).expect("the file");
+    let cut_path = folder.path().join("cut.mcap");
+    let mut n_before = 0;
+    for eighth in 1..8 {
+        std::fs::write(&cut_path, &whole[..whole.len() * eighth / 8]).expect("a shorter file");
+        let (read, recording) = replay(&cut_path);
+        assert!(read.len() >= n_before && read.len() < sent.len(), "{} of {} samples", read.len(), sent.len());
+        assert!(read[..] == sent[..read.len()], "what is left is unchanged");
+        let damage = recording.damage().expect("the cut is told");
+        assert!(damage.contains("cut off") && damage.contains(&read.len().to_string()), "{damage}");
+        n_before = read.len();
+    }
+    assert!(n_before > sent.len() / 2, "a cut near the end loses little: {n_before} of {}", sent.len());
+}
+
+#[test]
+fn a_flipped_bit_is_noticed() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    record(&path, &samples());
+    let mut bytes = std::fs::read(&path).expect("the file");
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 4;
+    std::fs::write(&path, bytes).expect("the file");
+    let mut recording = Recording::open(&path).expect("the start is fine");
+    let mut n_samples = 0;
+    let told = loop {
+        match recording.next_sample() {
+            Ok(Some(_)) => n_samples += 1,
+            Ok(None) => break recording.damage().map(str::to_owned),
+            Err(e) => break Some(e.to_string()),
+        }
+    };
+    assert!(n_samples > 10 && told.is_some(), "{n_samples} samples, {told:?}");
+}
+
+#[test]
+fn an_unfinished_recording_is_readable() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    let sent = samples();
+    let mut recorder = Recorder::create(&path, &About::default()).expect("a new file");
+    for sample in &sent {
+        recorder.write(sample).expect("room on the disk");
+    }
+    std::mem::forget(recorder); // As when the program is killed.
+    let (read, recording) = replay(&path);
+    assert!(read[..] == sent[..read.len()]);
+    let last = read.last().expect("some").stamp();
+    assert!(sent[sent.len() - 1].stamp().0 - last.0 < 1_100_000_000, "at most about a second is lost");
+    assert!(recording.damage().is_some());
+}
+
+#[test]
+fn what_is_no_recording_is_refused_in_one_sentence() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let missing = Recording::open(&folder.path().join("missing.mcap")).expect_err("there is none");
+    assert!(matches!(missing, Error::Open { .. }) && missing.to_string().contains("missing.mcap"));
+    for content in [&b""[..], b"short", b"a longer text that is no recording at all"] {
+        let path = folder.path().join("text.mcap");
+        std::fs::write(&path, content).expect("a file");
+        let refused = Recording::open(&path).expect_err("no recording");
+        assert!(matches!(refused, Error::NotARecording { .. }), "{refused}");
+    }
+    let empty = folder.path().join("empty.mcap");
+    record(&empty, &[]);
+    assert!(matches!(Recording::open(&empty), Err(Error::EmptyRecording { .. })));
+}
+
+#[test]
+fn a_full_disk_is_told_when_it_happens() {
+    let Ok(mut recorder) = Recorder::create(Path::new("/dev/full"), &About::default()) else {
+        return; // Told at once, which is as good: the header did not fit.
+    };
+    let told = samples().iter().map(|sample| recorder.write(sample)).find_map(Result::err);
+    let told = told.expect("nothing fits on a full disk").to_string();
+    assert!(told.contains("/dev/full") && told.contains("stays readable"), "{told}");
+}
