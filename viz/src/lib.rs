@@ -1,1 +1,22 @@
 //! The operator's window: a render server and its web page.
+//!
+//! The training thread talks to a [`Hub`], which never makes it wait; a [`Server`] passes what lies in the
+//! hub to browsers over one port, as `docs/protocol.md` tells.
+
+mod error;
+mod hub;
+mod news;
+mod page;
+mod picture;
+mod pose;
+mod protocol;
+mod queue;
+mod render_order;
+mod server;
+mod session;
+
+pub use error::Error;
+pub use hub::{Hub, PendingRender};
+pub use news::{KeyframePose, LiveImage, LivePixels, SceneHint, Status};
+pub use protocol::PROTOCOL_VERSION;
+pub use server::{Server, ServerConfig};

@@ -1,0 +1,15 @@
+#!/bin/sh
+# Bundles the web page that the binary embeds into viz/web/dist. Needs Node.js 18 or newer with npm.
+set -eu
+cd "$(dirname "$0")/../viz/web"
+if ! command -v npm >/dev/null 2>&1; then
+    echo "the web page needs Node.js 18 or newer with npm; on Debian and Ubuntu run: apt-get install nodejs npm" >&2
+    exit 1
+fi
+# Packages are installed again only when the lock file changed.
+if [ ! -e node_modules/.installed ] || ! cmp -s package-lock.json node_modules/.installed; then
+    npm ci --no-fund --no-audit
+    cp package-lock.json node_modules/.installed
+fi
+npm run --silent check
+npm run --silent build

@@ -1,0 +1,199 @@
+//! The meeting place of the training thread and the server; no call of the training thread waits for a client.
+
+use crate::news::{KeyframePose, LiveImage, LiveSlot, SceneHint, Status};
+use crate::pose::row_major;
+use crate::protocol::{PictureHeader, ProjectionMessage};
+use crate::queue::{Outgoing, Queue, Ticket};
+use crate::render_order::RenderOrder;
+use std::collections::BTreeMap;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::{Duration, Instant};
+use tokio::sync::{Notify, watch};
+use trainer::{Picture, Projection, RenderRequest};
+
+/// Handle shared by the training thread and a [`Server`](crate::Server); clones lead to the same hub.
+#[derive(Clone, Debug, Default)]
+pub struct Hub {
+    shared: Arc<Shared>,
+}
+
+/// Latest images by camera name.
+pub(crate) type LiveImages = BTreeMap<Arc<str>, Arc<LiveSlot>>;
+
+#[derive(Debug, Default)]
+struct Shared {
+    status: watch::Sender<Option<Arc<Status>>>,
+    scene: watch::Sender<Option<Arc<SceneHint>>>,
+    keyframes: watch::Sender<Arc<[KeyframePose]>>,
+    live_images: watch::Sender<LiveImages>,
+    queue: Mutex<Queue>,
+    work_arrived: Condvar,
+}
+
+impl Hub {
+    /// An empty hub.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Tells the clients where the run stands.
+    pub fn set_status(&self, status: Status) {
+        self.shared.status.send_replace(Some(Arc::new(status.thinned())));
+    }
+
+    /// Shows what a camera sees. It is encoded later and elsewhere, and only if somebody looks.
+    pub fn set_live_image(&self, image: LiveImage) {
+        let slot = Arc::new(LiveSlot { image, jpeg: OnceLock::new() });
+        self.shared.live_images.send_modify(|images| {
+            images.insert(Arc::clone(&slot.image.camera), slot);
+        });
+    }
+
+    /// Says where an operator's view starts.
+    pub fn set_scene_hint(&self, hint: SceneHint) {
+        self.shared.scene.send_replace(Some(Arc::new(hint)));
+    }
+
+    /// Replaces the frustums that are drawn; call it when the keyframes have changed.
+    pub fn set_keyframes(&self, keyframes: Vec<KeyframePose>) {
+        self.shared.keyframes.send_replace(keyframes.into());
+    }
+
+    /// How many clients are connected.
+    pub fn n_clients(&self) -> usize {
+        self.queue().n_clients()
+    }
+
+    /// The next picture to draw, if a client waits for one.
+    ///
+    /// One call gives one stage of one client; clients are served in turn.
+    pub fn next_request(&self) -> Option<PendingRender> {
+        let ticket = self.queue().take()?;
+        Some(PendingRender {
+            request: ticket.order.stage_request(ticket.stage),
+            begun: Instant::now(),
+            hub: self.clone(),
+            ticket,
+            is_settled: false,
+        })
+    }
+
+    /// Waits until a client asks for a picture, at most `timeout`; says whether one did.
+    ///
+    /// For a caller that has nothing to train.
+    pub fn wait_for_request(&self, timeout: Duration) -> bool {
+        let waited = self.shared.work_arrived.wait_timeout_while(self.queue(), timeout, |queue| !queue.has_work());
+        waited.unwrap_or_else(PoisonError::into_inner).0.has_work()
+    }
+
+    pub(crate) fn join(&self) -> (u64, Arc<Notify>) {
+        self.queue().join()
+    }
+
+    pub(crate) fn leave(&self, client: u64) {
+        self.queue().leave(client);
+    }
+
+    pub(crate) fn order(&self, client: u64, order: RenderOrder) {
+        self.queue().order(client, order);
+        self.shared.work_arrived.notify_all();
+    }
+
+    pub(crate) fn collect(&self, client: u64) -> Option<Outgoing> {
+        self.queue().collect(client)
+    }
+
+    pub(crate) fn settle(&self, client: u64) {
+        self.queue().settle(client);
+        self.shared.work_arrived.notify_all();
+    }
+
+    pub(crate) fn status(&self) -> watch::Receiver<Option<Arc<Status>>> {
+        self.shared.status.subscribe()
+    }
+
+    pub(crate) fn scene(&self) -> watch::Receiver<Option<Arc<SceneHint>>> {
+        self.shared.scene.subscribe()
+    }
+
+    pub(crate) fn keyframes(&self) -> watch::Receiver<Arc<[KeyframePose]>> {
+        self.shared.keyframes.subscribe()
+    }
+
+    pub(crate) fn live_images(&self) -> watch::Receiver<LiveImages> {
+        self.shared.live_images.subscribe()
+    }
+
+    /// The queue holds plain values that are valid after every statement, so a panic elsewhere spoils nothing.
+    fn queue(&self) -> MutexGuard<'_, Queue> {
+        self.shared.queue.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// One picture that a client waits for; dropped without an answer, the client gets nothing for this stage.
+#[derive(Debug)]
+pub struct PendingRender {
+    /// What to draw, at the size of this stage.
+    pub request: RenderRequest,
+    begun: Instant,
+    hub: Hub,
+    ticket: Ticket,
+    is_settled: bool,
+}
+
+impl PendingRender {
+    /// Sends the drawn picture to the client; encoding happens on the server's side.
+    pub fn deliver(mut self, picture: Picture) {
+        let header = self.header(&picture);
+        self.answer(Outgoing::Picture(Box::new((self.ticket.clone(), header, picture))));
+    }
+
+    /// Tells the client in one sentence why this picture could not be drawn.
+    pub fn fail(mut self, reason: &str) {
+        self.answer(Outgoing::Failed { id: self.ticket.order.id, reason: reason.to_owned() });
+    }
+
+    fn answer(&mut self, outgoing: Outgoing) {
+        self.is_settled = true; // The session settles it once it is sent.
+        self.hub.queue().put(self.ticket.client, outgoing);
+    }
+
+    fn header(&self, picture: &Picture) -> PictureHeader {
+        let order = &self.ticket.order;
+        PictureHeader {
+            id: order.id,
+            stage: self.ticket.stage,
+            n_stages: order.stages.len(),
+            scale: order.stages[self.ticket.stage],
+            last: self.ticket.stage + 1 == order.stages.len(),
+            size_px: picture.size_px,
+            full_size_px: order.request.size_px,
+            world_from_camera: row_major(&order.request.world_from_camera),
+            projection: projection_message(&order.request.projection),
+            near_m: order.request.near_m,
+            far_m: order.request.far_m,
+            render_millis: self.begun.elapsed().as_secs_f64() * 1e3,
+            color: None,
+            depth: None,
+        }
+    }
+}
+
+impl Drop for PendingRender {
+    fn drop(&mut self) {
+        if !self.is_settled {
+            self.hub.settle(self.ticket.client);
+        }
+    }
+}
+
+fn projection_message(projection: &Projection) -> ProjectionMessage {
+    match *projection {
+        Projection::Pinhole { focal_px, principal_px } => ProjectionMessage::Pinhole {
+            focal_px: Some(focal_px),
+            principal_px: Some(principal_px),
+            vertical_fov_rad: None,
+        },
+        Projection::Equirectangular => ProjectionMessage::Equirectangular {},
+    }
+}

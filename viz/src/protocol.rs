@@ -1,0 +1,261 @@
+//! The messages of `docs/protocol.md` as they are written on the wire.
+
+use crate::news::{KeyframePose, LiveImage, SceneHint, Status};
+use crate::pose::row_major;
+use serde::{Deserialize, Serialize};
+
+/// Version of the messages; a client that says another one is sent away.
+pub const PROTOCOL_VERSION: u32 = 1;
+
+/// Longest text message a client may send, bytes.
+pub(crate) const MAX_MESSAGE_BYTES: usize = 64 * 1024;
+
+/// What a client may say.
+#[derive(Debug, Deserialize)]
+#[serde(tag = "type", rename_all = "snake_case")]
+pub(crate) enum ClientMessage {
+    /// The version the client was written for.
+    Hello(ClientHello),
+    /// Draw this; replaces what this client asked before.
+    Render(Box<RenderMessage>),
+    /// The client leaves.
+    Goodbye(ClientGoodbye),
+}
+
+/// Fields of a client's `hello`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct ClientHello {
+    /// See [`PROTOCOL_VERSION`].
+    pub(crate) protocol: u32,
+}
+
+/// A client's `goodbye` has no fields.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct ClientGoodbye {}
+
+/// Fields of `render`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct RenderMessage {
+    /// The client's own number, repeated in the pictures.
+    pub(crate) id: u64,
+    /// Row major.
+    pub(crate) world_from_camera: [f64; 16],
+    /// Full size.
+    pub(crate) size_px: [u32; 2],
+    /// How directions map to pixels.
+    pub(crate) projection: ProjectionMessage,
+    /// Linear scales of the full size.
+    pub(crate) stages: Option<Vec<f64>>,
+    /// Along z.
+    pub(crate) near_m: Option<f64>,
+    /// Along z.
+    pub(crate) far_m: Option<f64>,
+    /// Only what lies inside is drawn.
+    pub(crate) crop: Option<CropMessage>,
+    /// Wanted outputs.
+    pub(crate) outputs: Option<Vec<Output>>,
+    /// Only with the output `depth`.
+    pub(crate) depth_format: Option<DepthFormat>,
+    /// Behind everything, 0 to 1.
+    pub(crate) background_srgb: Option<[f32; 3]>,
+}
+
+/// How directions map to pixels.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize, Serialize)]
+#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
+pub(crate) enum ProjectionMessage {
+    /// Either `focal_px` or `vertical_fov_rad`.
+    Pinhole {
+        /// Pixels of the full size.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        focal_px: Option<[f64; 2]>,
+        /// Pixels of the full size; the middle if absent.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        principal_px: Option<[f64; 2]>,
+        /// Angle from the top to the bottom edge, with square pixels.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        vertical_fov_rad: Option<f64>,
+    },
+    /// All directions.
+    Equirectangular {},
+}
+
+/// A box with sides along the axes of its frame.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct CropMessage {
+    /// Row major; the world's axes if absent.
+    pub(crate) world_from_box: Option<[f64; 16]>,
+    /// Smallest corner.
+    pub(crate) min_m: [f64; 3],
+    /// Largest corner.
+    pub(crate) max_m: [f64; 3],
+}
+
+/// What a picture may hold.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Output {
+    /// JPEG.
+    Color,
+    /// Metres along z, see [`DepthFormat`].
+    Depth,
+}
+
+/// How depth is packed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum DepthFormat {
+    /// 16-bit counts at half the picture's size; the nearest of each 2x2 pixels.
+    #[default]
+    U16Half,
+    /// 32-bit floats at the picture's size, as the model gave them.
+    F32,
+}
+
+/// What the server says as JSON text.
+#[derive(Debug, Serialize)]
+#[serde(tag = "type", rename_all = "snake_case")]
+pub(crate) enum ServerMessage<'a> {
+    /// First message of a connection.
+    Hello { protocol: u32, server: &'a str, client: u64, max_size_px: [u32; 2], default_stages: &'a [f64] },
+    /// Where the run stands.
+    Status(&'a Status),
+    /// Where the scene is.
+    Scene { center_m: [f64; 3], radius_m: f64, world_from_camera: [f64; 16] },
+    /// Poses of all keyframes held.
+    Keyframes { keyframes: Vec<KeyframeMessage<'a>> },
+    /// What was wrong with a message or a picture.
+    Error { id: Option<u64>, message: &'a str },
+    /// The connection ends.
+    Goodbye { reason: &'a str },
+}
+
+/// One keyframe of `keyframes`.
+#[derive(Debug, Serialize)]
+pub(crate) struct KeyframeMessage<'a> {
+    camera: &'a str,
+    world_from_camera: [f64; 16],
+    size_px: [u32; 2],
+    focal_px: [f64; 2],
+    principal_px: [f64; 2],
+}
+
+impl<'a> From<&'a KeyframePose> for KeyframeMessage<'a> {
+    fn from(keyframe: &'a KeyframePose) -> Self {
+        Self {
+            camera: &keyframe.camera,
+            world_from_camera: row_major(&keyframe.world_from_camera),
+            size_px: keyframe.size_px,
+            focal_px: keyframe.focal_px,
+            principal_px: keyframe.principal_px,
+        }
+    }
+}
+
+impl From<&SceneHint> for ServerMessage<'_> {
+    fn from(hint: &SceneHint) -> Self {
+        Self::Scene {
+            center_m: hint.center_m,
+            radius_m: hint.radius_m,
+            world_from_camera: row_major(&hint.world_from_camera),
+        }
+    }
+}
+
+/// Header of a binary message.
+#[derive(Debug, Serialize)]
+#[serde(tag = "type", rename_all = "snake_case")]
+pub(crate) enum BinaryHeader<'a> {
+    /// A drawn picture.
+    Picture(&'a PictureHeader),
+    /// What a camera sees.
+    LiveImage(&'a LiveHeader<'a>),
+}
+
+/// Header of `picture`.
+#[derive(Debug, Serialize)]
+pub(crate) struct PictureHeader {
+    pub(crate) id: u64,
+    pub(crate) stage: usize,
+    pub(crate) n_stages: usize,
+    pub(crate) scale: f64,
+    pub(crate) last: bool,
+    pub(crate) size_px: [u32; 2],
+    pub(crate) full_size_px: [u32; 2],
+    pub(crate) world_from_camera: [f64; 16],
+    pub(crate) projection: ProjectionMessage,
+    pub(crate) near_m: f64,
+    pub(crate) far_m: f64,
+    pub(crate) render_millis: f64,
+    pub(crate) color: Option<ColorPart>,
+    pub(crate) depth: Option<DepthPart>,
+}
+
+/// Where the color lies in the payload.
+#[derive(Debug, Serialize)]
+pub(crate) struct ColorPart {
+    pub(crate) format: &'static str,
+    pub(crate) offset: usize,
+    pub(crate) bytes: usize,
+}
+
+/// Where the depth lies in the payload and how to read it.
+#[derive(Debug, Serialize)]
+pub(crate) struct DepthPart {
+    pub(crate) format: DepthFormat,
+    pub(crate) size_px: [u32; 2],
+    pub(crate) metres_per_count: f64,
+    pub(crate) offset: usize,
+    pub(crate) bytes: usize,
+}
+
+/// Header of `live_image`.
+#[derive(Debug, Serialize)]
+pub(crate) struct LiveHeader<'a> {
+    camera: &'a str,
+    stamp_nanos: i64,
+    size_px: [u32; 2],
+    format: &'static str,
+    world_from_camera: Option<[f64; 16]>,
+    focal_px: [f64; 2],
+    principal_px: [f64; 2],
+}
+
+impl<'a> From<&'a LiveImage> for LiveHeader<'a> {
+    fn from(image: &'a LiveImage) -> Self {
+        Self {
+            camera: &image.camera,
+            stamp_nanos: image.stamp.0,
+            size_px: image.size_px,
+            format: "jpeg",
+            world_from_camera: image.world_from_camera.as_ref().map(row_major),
+            focal_px: image.focal_px,
+            principal_px: image.principal_px,
+        }
+    }
+}
+
+impl ServerMessage<'_> {
+    /// The message as JSON.
+    pub(crate) fn to_json(&self) -> String {
+        serde_json::to_string(self).expect("these types hold only strings, numbers and maps with string keys")
+    }
+}
+
+/// A binary message: header length as little-endian u32, JSON header, payload.
+pub(crate) fn frame(header: &BinaryHeader<'_>, payload: &[&[u8]]) -> Vec<u8> {
+    let header = serde_json::to_vec(header).expect("these types hold only strings and numbers");
+    let n_header = u32::try_from(header.len()).expect("a header has some hundred bytes");
+    let n_payload: usize = payload.iter().map(|part| part.len()).sum();
+    let mut bytes = Vec::with_capacity(4 + header.len() + n_payload);
+    bytes.extend_from_slice(&n_header.to_le_bytes());
+    bytes.extend_from_slice(&header);
+    for part in payload {
+        bytes.extend_from_slice(part);
+    }
+    bytes
+}

@@ -1,0 +1,207 @@
+//! Who waits for which picture: the newest order of each client, stage by stage, clients in turn.
+
+use crate::protocol::PictureHeader;
+use crate::render_order::RenderOrder;
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+use tokio::sync::Notify;
+use trainer::Picture;
+
+/// Pictures of one client that may be drawn or on their way; a slow client costs no more rendering than this.
+const MAX_UNSENT: usize = 2;
+
+/// All connected clients and what they wait for.
+#[derive(Debug, Default)]
+pub(crate) struct Queue {
+    clients: BTreeMap<u64, Waiting>,
+    n_joined: u64,
+    last_served: u64,
+}
+
+/// What one client waits for.
+#[derive(Debug, Default)]
+struct Waiting {
+    order: Option<Arc<RenderOrder>>,
+    next_stage: usize,
+    n_unsent: usize,
+    outbox: VecDeque<Outgoing>,
+    wake: Arc<Notify>,
+}
+
+/// One stage that the training side shall draw.
+#[derive(Clone, Debug)]
+pub(crate) struct Ticket {
+    /// Who asked.
+    pub(crate) client: u64,
+    /// What was asked.
+    pub(crate) order: Arc<RenderOrder>,
+    /// Which of the order's stages.
+    pub(crate) stage: usize,
+}
+
+/// What goes out to a client.
+#[derive(Debug)]
+pub(crate) enum Outgoing {
+    /// A drawn stage, not yet encoded; the header still lacks the payload's parts.
+    Picture(Box<(Ticket, PictureHeader, Picture)>),
+    /// A stage that could not be drawn.
+    Failed { id: u64, reason: String },
+}
+
+impl Queue {
+    /// Adds a client; the returned handle is notified when something lies in its outbox.
+    pub(crate) fn join(&mut self) -> (u64, Arc<Notify>) {
+        self.n_joined += 1;
+        let waiting = Waiting::default();
+        let wake = Arc::clone(&waiting.wake);
+        self.clients.insert(self.n_joined, waiting);
+        (self.n_joined, wake)
+    }
+
+    /// Forgets a client and all it waits for.
+    pub(crate) fn leave(&mut self, client: u64) {
+        self.clients.remove(&client);
+    }
+
+    /// How many clients are connected.
+    pub(crate) fn n_clients(&self) -> usize {
+        self.clients.len()
+    }
+
+    /// Takes an order in; the stages of the client's older order that nobody has begun are given up.
+    pub(crate) fn order(&mut self, client: u64, order: RenderOrder) {
+        if let Some(waiting) = self.clients.get_mut(&client) {
+            waiting.order = Some(Arc::new(order));
+            waiting.next_stage = 0;
+        }
+    }
+
+    /// Whether [`take`](Self::take) would give something.
+    pub(crate) fn has_work(&self) -> bool {
+        self.clients.values().any(Waiting::is_ready)
+    }
+
+    /// The next stage to draw: clients in turn, each client's stages in order.
+    pub(crate) fn take(&mut self) -> Option<Ticket> {
+        let after = self.clients.range(self.last_served + 1..).find(|(_, waiting)| waiting.is_ready());
+        let (&client, _) = after.or_else(|| self.clients.iter().find(|(_, waiting)| waiting.is_ready()))?;
+        self.last_served = client;
+        self.clients.get_mut(&client)?.take(client)
+    }
+
+    /// Puts a result into a client's outbox and wakes it.
+    pub(crate) fn put(&mut self, client: u64, outgoing: Outgoing) {
+        if let Some(waiting) = self.clients.get_mut(&client) {
+            waiting.outbox.push_back(outgoing);
+            waiting.wake.notify_one();
+        }
+    }
+
+    /// The oldest result in a client's outbox.
+    pub(crate) fn collect(&mut self, client: u64) -> Option<Outgoing> {
+        self.clients.get_mut(&client)?.outbox.pop_front()
+    }
+
+    /// One stage of a client is sent, or will never be drawn.
+    pub(crate) fn settle(&mut self, client: u64) {
+        if let Some(waiting) = self.clients.get_mut(&client) {
+            waiting.n_unsent = waiting.n_unsent.saturating_sub(1);
+        }
+    }
+}
+
+impl Waiting {
+    fn is_ready(&self) -> bool {
+        self.order.is_some() && self.n_unsent < MAX_UNSENT
+    }
+
+    fn take(&mut self, client: u64) -> Option<Ticket> {
+        let order = self.order.clone()?;
+        let stage = self.next_stage;
+        self.next_stage += 1;
+        self.n_unsent += 1;
+        if self.next_stage == order.stages.len() {
+            self.order = None;
+        }
+        Some(Ticket { client, order, stage })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Queue;
+    use crate::protocol::RenderMessage;
+    use crate::render_order::RenderOrder;
+
+    fn order(id: u64) -> RenderOrder {
+        let message: RenderMessage = serde_json::from_value(serde_json::json!({
+            "id": id, "size_px": [100, 100], "projection": {"kind": "equirectangular"},
+            "world_from_camera": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1],
+        }))
+        .expect("valid");
+        RenderOrder::check(&message).expect("valid")
+    }
+
+    /// Takes and settles at once, as with a fast client.
+    fn drain(queue: &mut Queue) -> Vec<(u64, u64, usize)> {
+        std::iter::from_fn(|| {
+            let ticket = queue.take()?;
+            queue.settle(ticket.client);
+            Some((ticket.client, ticket.order.id, ticket.stage))
+        })
+        .collect()
+    }
+
+    #[test]
+    fn clients_are_served_in_turn() {
+        let mut queue = Queue::default();
+        let (a, _) = queue.join();
+        let (b, _) = queue.join();
+        queue.order(a, order(10));
+        queue.order(b, order(20));
+        let served = drain(&mut queue);
+        assert_eq!(served, [(a, 10, 0), (b, 20, 0), (a, 10, 1), (b, 20, 1), (a, 10, 2), (b, 20, 2)]);
+    }
+
+    #[test]
+    fn a_newer_order_replaces_the_waiting_stages() {
+        let mut queue = Queue::default();
+        let (a, _) = queue.join();
+        queue.order(a, order(1));
+        let first = queue.take().expect("an order waits");
+        assert_eq!((first.order.id, first.stage), (1, 0));
+        queue.order(a, order(2));
+        queue.settle(a);
+        assert_eq!(drain(&mut queue), [(a, 2, 0), (a, 2, 1), (a, 2, 2)]);
+    }
+
+    #[test]
+    fn a_slow_client_holds_up_only_itself() {
+        let mut queue = Queue::default();
+        let (slow, _) = queue.join();
+        let (fast, _) = queue.join();
+        queue.order(slow, order(1));
+        queue.order(fast, order(2));
+        let mut served = Vec::new();
+        while let Some(ticket) = queue.take() {
+            if ticket.client == fast {
+                queue.settle(fast);
+            }
+            served.push(ticket.client);
+        }
+        assert_eq!(served, [slow, fast, slow, fast, fast]);
+        queue.settle(slow);
+        assert!(queue.has_work());
+    }
+
+    #[test]
+    fn nothing_is_kept_of_a_client_that_left() {
+        let mut queue = Queue::default();
+        let (a, _) = queue.join();
+        queue.order(a, order(1));
+        queue.leave(a);
+        assert!(queue.take().is_none() && !queue.has_work() && queue.n_clients() == 0);
+        queue.order(a, order(2));
+        assert!(queue.take().is_none());
+    }
+}

@@ -1,0 +1,230 @@
+//! A client's checked wish for a picture, and its stages.
+
+use crate::pose::from_row_major;
+use crate::protocol::{CropMessage, DepthFormat, Output, ProjectionMessage, RenderMessage};
+use kinematics::Transform;
+use trainer::{Aabb, Projection, RenderRequest};
+
+/// Largest width and height a client may ask for, pixels.
+pub(crate) const MAX_SIZE_PX: u32 = 4096;
+/// Most stages of one request.
+const MAX_STAGES: usize = 8;
+/// Shares of the full width and height that are drawn one after the other if the client does not say.
+pub(crate) const DEFAULT_STAGES: [f64; 3] = [0.1, 0.5, 1.0];
+/// Nearest drawn depth if the client does not say, metres.
+const DEFAULT_NEAR_M: f64 = 0.01;
+/// Furthest drawn depth if the client does not say, metres.
+const DEFAULT_FAR_M: f64 = 100.0;
+
+/// What is wrong with a message; shown to the client.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum Malformed {
+    #[error("the message is not understood: {0}")]
+    Json(#[from] serde_json::Error),
+    #[error("{field} is not a rigid motion: 16 numbers row major, orthonormal rotation, last row 0 0 0 1")]
+    NotRigid { field: &'static str },
+    #[error("size_px is {got:?}, allowed are 1 to {MAX_SIZE_PX} each")]
+    Size { got: [u32; 2] },
+    #[error("stages must be 1 to {MAX_STAGES} scales above 0 and at most 1")]
+    Stages,
+    #[error("near_m {near_m} and far_m {far_m} must be finite with 0 < near_m < far_m")]
+    NearFar { near_m: f64, far_m: f64 },
+    #[error(
+        "a pinhole projection needs either focal_px above 0 or vertical_fov_rad between 0 and pi, and a finite principal_px"
+    )]
+    Pinhole,
+    #[error("crop needs finite corners with min_m below max_m on every axis")]
+    Crop,
+    #[error("outputs must name color, depth or both")]
+    NoOutput,
+    #[error("background_srgb must be three numbers from 0 to 1")]
+    Background,
+}
+
+/// A checked render message.
+#[derive(Clone, Debug)]
+pub(crate) struct RenderOrder {
+    /// The client's own number.
+    pub(crate) id: u64,
+    /// At full size.
+    pub(crate) request: RenderRequest,
+    /// Linear scales, in the order they are drawn.
+    pub(crate) stages: Vec<f64>,
+    /// Whether color is wanted.
+    pub(crate) color: bool,
+    /// Whether and how depth is wanted.
+    pub(crate) depth: Option<DepthFormat>,
+}
+
+impl RenderOrder {
+    /// Checks what a client sent.
+    pub(crate) fn check(message: &RenderMessage) -> Result<Self, Malformed> {
+        let outputs = message.outputs.as_deref().unwrap_or(&[Output::Color]);
+        if outputs.is_empty() {
+            return Err(Malformed::NoOutput);
+        }
+        let size_px = checked_size(message.size_px)?;
+        let (near_m, far_m) =
+            checked_range(message.near_m.unwrap_or(DEFAULT_NEAR_M), message.far_m.unwrap_or(DEFAULT_FAR_M))?;
+        Ok(Self {
+            id: message.id,
+            request: RenderRequest {
+                world_from_camera: rigid(&message.world_from_camera, "world_from_camera")?,
+                size_px,
+                projection: checked_projection(&message.projection, size_px)?,
+                shutter: None,
+                near_m,
+                far_m,
+                crop: message.crop.as_ref().map(checked_crop).transpose()?,
+                background_srgb: checked_background(message.background_srgb.unwrap_or([0.0; 3]))?,
+            },
+            stages: checked_stages(message.stages.as_deref().unwrap_or(&DEFAULT_STAGES))?,
+            color: outputs.contains(&Output::Color),
+            depth: outputs.contains(&Output::Depth).then(|| message.depth_format.unwrap_or_default()),
+        })
+    }
+
+    /// The request of one stage: same field of view, fewer pixels.
+    pub(crate) fn stage_request(&self, stage: usize) -> RenderRequest {
+        let full = self.request.size_px.map(f64::from);
+        let scale = self.stages[stage];
+        let size_px = self.request.size_px.map(|n| scaled(n, scale));
+        let ratio = [f64::from(size_px[0]) / full[0], f64::from(size_px[1]) / full[1]];
+        let projection = match self.request.projection {
+            Projection::Pinhole { focal_px, principal_px } => Projection::Pinhole {
+                focal_px: [focal_px[0] * ratio[0], focal_px[1] * ratio[1]],
+                principal_px: [principal_px[0] * ratio[0], principal_px[1] * ratio[1]],
+            },
+            Projection::Equirectangular => Projection::Equirectangular,
+        };
+        RenderRequest { size_px, projection, ..self.request.clone() }
+    }
+}
+
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 < scale <= 1 keeps the product in u32")]
+fn scaled(n: u32, scale: f64) -> u32 {
+    (f64::from(n) * scale).round().max(1.0) as u32
+}
+
+fn rigid(rows: &[f64; 16], field: &'static str) -> Result<Transform, Malformed> {
+    from_row_major(rows).ok_or(Malformed::NotRigid { field })
+}
+
+fn checked_size(size_px: [u32; 2]) -> Result<[u32; 2], Malformed> {
+    let fits = size_px.iter().all(|n| (1..=MAX_SIZE_PX).contains(n));
+    if fits { Ok(size_px) } else { Err(Malformed::Size { got: size_px }) }
+}
+
+fn checked_range(near_m: f64, far_m: f64) -> Result<(f64, f64), Malformed> {
+    let fits = near_m > 0.0 && near_m < far_m && far_m.is_finite();
+    if fits { Ok((near_m, far_m)) } else { Err(Malformed::NearFar { near_m, far_m }) }
+}
+
+fn checked_stages(stages: &[f64]) -> Result<Vec<f64>, Malformed> {
+    let fits = (1..=MAX_STAGES).contains(&stages.len()) && stages.iter().all(|scale| *scale > 0.0 && *scale <= 1.0);
+    if fits { Ok(stages.to_vec()) } else { Err(Malformed::Stages) }
+}
+
+fn checked_projection(message: &ProjectionMessage, size_px: [u32; 2]) -> Result<Projection, Malformed> {
+    let ProjectionMessage::Pinhole { focal_px, principal_px, vertical_fov_rad } = *message else {
+        return Ok(Projection::Equirectangular);
+    };
+    let [width, height] = size_px.map(f64::from);
+    let focal_px = match (focal_px, vertical_fov_rad) {
+        (Some(focal_px), None) => focal_px,
+        (None, Some(angle)) if angle > 0.0 && angle < std::f64::consts::PI => [0.5 * height / (0.5 * angle).tan(); 2],
+        _ => return Err(Malformed::Pinhole),
+    };
+    let principal_px = principal_px.unwrap_or([0.5 * width, 0.5 * height]);
+    let fits = focal_px.iter().all(|f| *f > 0.0 && f.is_finite()) && principal_px.iter().all(|c| c.is_finite());
+    if fits { Ok(Projection::Pinhole { focal_px, principal_px }) } else { Err(Malformed::Pinhole) }
+}
+
+fn checked_crop(message: &CropMessage) -> Result<Aabb, Malformed> {
+    let world_from_box = match &message.world_from_box {
+        Some(rows) => rigid(rows, "world_from_box")?,
+        None => Transform::identity(),
+    };
+    let fits = message.min_m.iter().zip(&message.max_m).all(|(min, max)| min < max && (max - min).is_finite());
+    if fits { Ok(Aabb { world_from_box, min_m: message.min_m, max_m: message.max_m }) } else { Err(Malformed::Crop) }
+}
+
+fn checked_background(color: [f32; 3]) -> Result<[f32; 3], Malformed> {
+    let fits = color.iter().all(|c| (0.0..=1.0).contains(c));
+    if fits { Ok(color) } else { Err(Malformed::Background) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Malformed, RenderOrder};
+    use crate::protocol::RenderMessage;
+    use serde_json::{Value, json};
+    use trainer::Projection;
+
+    fn message(change: impl FnOnce(&mut Value)) -> Result<RenderOrder, Malformed> {
+        let mut value = json!({
+            "id": 7, "size_px": [1280, 720],
+            "world_from_camera": [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 2, 0, 0, 0, 1],
+            "projection": {"kind": "pinhole", "focal_px": [900.0, 910.0], "principal_px": [630.0, 365.0]},
+        });
+        change(&mut value);
+        RenderOrder::check(&serde_json::from_value::<RenderMessage>(value)?)
+    }
+
+    #[test]
+    fn stages_keep_the_field_of_view() {
+        let order = message(|_| ()).expect("valid");
+        assert_eq!(order.stages, [0.1, 0.5, 1.0]);
+        let sizes: Vec<_> = (0..3).map(|stage| order.stage_request(stage).size_px).collect();
+        assert_eq!(sizes, [[128, 72], [640, 360], [1280, 720]]);
+        let Projection::Pinhole { focal_px, principal_px } = order.stage_request(0).projection else {
+            panic!("a pinhole stays one");
+        };
+        for (got, expected) in focal_px.iter().chain(&principal_px).zip([90.0, 91.0, 63.0, 36.5]) {
+            assert!((got - expected).abs() < 1e-9, "{got} instead of {expected}");
+        }
+        assert!(order.color && order.depth.is_none());
+    }
+
+    #[test]
+    fn the_smallest_stage_has_at_least_one_pixel() {
+        let order = message(|value| {
+            value["size_px"] = json!([3, 1]);
+            value["stages"] = json!([0.01]);
+        });
+        assert_eq!(order.expect("valid").stage_request(0).size_px, [1, 1]);
+    }
+
+    #[test]
+    fn a_field_of_view_becomes_a_focal_length() {
+        let right_angle = json!({"kind": "pinhole", "vertical_fov_rad": std::f64::consts::FRAC_PI_2});
+        let order = message(|value| value["projection"] = right_angle).expect("valid");
+        let Projection::Pinhole { focal_px, principal_px } = order.request.projection else {
+            panic!("a pinhole stays one");
+        };
+        assert!((focal_px[0] - 360.0).abs() < 1e-9 && (focal_px[1] - 360.0).abs() < 1e-9);
+        assert_eq!(principal_px, [640.0, 360.0]);
+    }
+
+    #[test]
+    fn every_wrong_field_is_named() {
+        let cases: [(&str, Value, &str); 12] = [
+            ("world_from_camera", json!([2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "world_from_camera"),
+            ("world_from_camera", json!([1, 2, 3]), "length"),
+            ("size_px", json!([0, 720]), "size_px"),
+            ("size_px", json!([1280, 5000]), "size_px"),
+            ("stages", json!([]), "stages"),
+            ("stages", json!([0.5, 1.5]), "stages"),
+            ("near_m", json!(-1.0), "near_m"),
+            ("projection", json!({"kind": "pinhole"}), "focal_px"),
+            ("projection", json!({"kind": "fisheye"}), "fisheye"),
+            ("crop", json!({"min_m": [0, 0, 0], "max_m": [1, 0, 1]}), "crop"),
+            ("background_srgb", json!([0.0, 2.0, 0.0]), "background_srgb"),
+            ("colour", json!(true), "colour"),
+        ];
+        for (field, wrong, named) in cases {
+            let error = message(|value| value[field] = wrong.clone()).expect_err(field).to_string();
+            assert!(error.contains(named), "{field} = {wrong}: {error}");
+        }
+    }
+}

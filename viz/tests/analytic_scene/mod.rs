@@ -1,0 +1,85 @@
+//! Ray casts a checkered floor and three balls, exactly, so that the wire and the page can be checked against it.
+
+use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
+use trainer::{Picture, Projection, RenderRequest};
+
+/// A ball: center and radius in metres, sRGB color.
+struct Ball {
+    center: Point3<f64>,
+    radius_m: f64,
+    color: [f64; 3],
+}
+
+/// Red on the x axis, green on the y axis, blue above the origin: a mirrored or turned picture shows.
+const BALLS: [Ball; 3] = [
+    Ball { center: Point3::new(0.5, 0.0, 0.15), radius_m: 0.15, color: [0.85, 0.2, 0.15] },
+    Ball { center: Point3::new(0.0, 0.5, 0.15), radius_m: 0.15, color: [0.2, 0.7, 0.25] },
+    Ball { center: Point3::new(0.0, 0.0, 0.5), radius_m: 0.12, color: [0.2, 0.35, 0.9] },
+];
+/// The floor ends here, so that there is background to see.
+const FLOOR_HALF_M: f64 = 1.0;
+
+/// A camera at (0, -2, 0.5) that looks along the world's y axis.
+pub(crate) fn looking_along_y() -> Isometry3<f64> {
+    let rotation = Rotation3::from_matrix_unchecked(Matrix3::new(1., 0., 0., 0., 0., 1., 0., -1., 0.));
+    Isometry3::from_parts(Translation3::new(0.0, -2.0, 0.5), UnitQuaternion::from_rotation_matrix(&rotation))
+}
+
+/// Draws what the request asks for.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "colors are between 0 and 1, depths are metres"
+)]
+pub(crate) fn draw(request: &RenderRequest) -> Picture {
+    let [width, height] = request.size_px;
+    let eye = Point3::from(request.world_from_camera.translation.vector);
+    let (mut rgba_srgb, mut depth_m) = (Vec::new(), Vec::new());
+    for y in 0..height {
+        for x in 0..width {
+            let ray = ray_in_camera(request, f64::from(x) + 0.5, f64::from(y) + 0.5);
+            let direction = request.world_from_camera.rotation * ray;
+            let hit = nearest_hit(request, eye, direction);
+            let color = hit.map_or(request.background_srgb.map(f64::from), |hit| hit.1);
+            rgba_srgb.extend(color.map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8));
+            rgba_srgb.push(if hit.is_some() { 255 } else { 0 });
+            depth_m.push(hit.map_or(0.0, |hit| hit.0 as f32));
+        }
+    }
+    Picture { size_px: request.size_px, rgba_srgb, depth_m }
+}
+
+/// Direction of a pixel; its length is 1 along z (pinhole) or 1 (equirectangular), so that hits are depths.
+fn ray_in_camera(request: &RenderRequest, u: f64, v: f64) -> Vector3<f64> {
+    match request.projection {
+        Projection::Pinhole { focal_px, principal_px } => {
+            Vector3::new((u - principal_px[0]) / focal_px[0], (v - principal_px[1]) / focal_px[1], 1.0)
+        }
+        Projection::Equirectangular => {
+            let longitude = (u / f64::from(request.size_px[0]) - 0.5) * std::f64::consts::TAU;
+            let latitude = (0.5 - v / f64::from(request.size_px[1])) * std::f64::consts::PI;
+            Vector3::new(latitude.cos() * longitude.sin(), -latitude.sin(), latitude.cos() * longitude.cos())
+        }
+    }
+}
+
+fn nearest_hit(request: &RenderRequest, eye: Point3<f64>, direction: Vector3<f64>) -> Option<(f64, [f64; 3])> {
+    let balls = BALLS.iter().filter_map(|ball| {
+        let from_center = eye - ball.center;
+        let (a, b) = (direction.norm_squared(), direction.dot(&from_center));
+        let discriminant = b * b - a * (from_center.norm_squared() - ball.radius_m * ball.radius_m);
+        let depth = (discriminant >= 0.0).then(|| (-b - discriminant.sqrt()) / a)?;
+        let normal = (eye + direction * depth - ball.center) / ball.radius_m;
+        let light = 0.35 + 0.65 * normal.dot(&Vector3::new(0.36, -0.48, 0.8)).max(0.0);
+        Some((depth, ball.color.map(|value| value * light)))
+    });
+    let floor_depth = -eye.z / direction.z;
+    let on_floor = eye + direction * floor_depth;
+    let is_on_floor = on_floor.x.abs() < FLOOR_HALF_M && on_floor.y.abs() < FLOOR_HALF_M;
+    let is_dark = ((on_floor.x * 5.0).floor() + (on_floor.y * 5.0).floor()).rem_euclid(2.0) < 0.5;
+    let floor = is_on_floor.then_some((floor_depth, if is_dark { [0.42, 0.4, 0.38] } else { [0.72, 0.7, 0.66] }));
+    balls
+        .chain(floor)
+        .filter(|(depth, _)| (request.near_m..=request.far_m).contains(depth))
+        .min_by(|a, b| a.0.total_cmp(&b.0))
+}

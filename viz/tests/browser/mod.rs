@@ -1,0 +1,145 @@
+//! Headless Chromium, driven over its debugging protocol.
+
+use serde_json::{Value, json};
+use std::io::{BufRead, BufReader};
+use std::net::TcpStream;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+use tungstenite::{Message, WebSocket};
+
+/// Far more than a browser needs on two busy cores.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A running browser with one page.
+pub(crate) struct Browser {
+    process: Child,
+    socket: WebSocket<TcpStream>,
+    session: String,
+    n_calls: u64,
+}
+
+/// Where Chromium is, if it is installed.
+pub(crate) fn chromium() -> Option<PathBuf> {
+    let names = ["chromium", "chromium-browser", "google-chrome"];
+    let folders: Vec<PathBuf> = std::env::split_paths(&std::env::var_os("PATH")?).collect();
+    let paths = names.iter().flat_map(|name| folders.iter().map(move |folder| folder.join(name)));
+    paths.into_iter().find(|path| path.is_file())
+}
+
+impl Browser {
+    /// Opens a page of this size in CSS pixels; the profile folder must be empty.
+    pub(crate) fn open(program: &Path, profile: &Path, url: &str, [width, height]: [u32; 2]) -> Self {
+        let mut process = Command::new(program)
+            .args(["--headless", "--no-sandbox", "--disable-quic", "--no-first-run"])
+            .args(["--disable-background-networking", "--disable-component-update", "--disable-sync"])
+            .args(["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--hide-scrollbars"])
+            .args(["--remote-debugging-port=0", "--force-device-scale-factor=1"])
+            .arg(format!("--window-size={width},{height}"))
+            .arg(format!("--user-data-dir={}", profile.display()))
+            .arg("about:blank")
+            .stderr(Stdio::piped())
+            .stdout(Stdio::null())
+            .spawn()
+            .expect("chromium starts");
+        let mut lines = BufReader::new(process.stderr.take().expect("stderr is piped")).lines();
+        let address = lines
+            .by_ref()
+            .map_while(Result::ok)
+            .find_map(|line| line.strip_prefix("DevTools listening on ").map(str::to_owned))
+            .expect("chromium tells its debugging address");
+        // The pipe is kept empty, else the browser would stop when it is full.
+        std::thread::spawn(move || lines.map_while(Result::ok).for_each(drop));
+        let host = address.trim_start_matches("ws://").split('/').next().expect("a host");
+        let stream = TcpStream::connect(host).expect("chromium listens");
+        stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
+        let (socket, _) = tungstenite::client(&address, stream).expect("a WebSocket");
+        let mut browser = Self { process, socket, session: String::new(), n_calls: 0 };
+        let target = browser.call("Target.createTarget", json!({"url": "about:blank"}));
+        let attached = browser.call("Target.attachToTarget", json!({"targetId": target["targetId"], "flatten": true}));
+        browser.session = attached["sessionId"].as_str().expect("a session").to_owned();
+        let size = json!({"width": width, "height": height, "deviceScaleFactor": 1, "mobile": false});
+        browser.call("Emulation.setDeviceMetricsOverride", size);
+        browser.call("Page.navigate", json!({"url": url}));
+        browser
+    }
+
+    /// Calls a method of the debugging protocol.
+    pub(crate) fn call(&mut self, method: &str, params: Value) -> Value {
+        self.n_calls += 1;
+        let mut message = json!({"id": self.n_calls, "method": method, "params": params});
+        if !self.session.is_empty() {
+            message["sessionId"] = json!(self.session);
+        }
+        self.socket.send(Message::text(message.to_string())).expect("sent");
+        loop {
+            let Message::Text(text) = self.socket.read().expect("chromium answers") else { continue };
+            let answer: Value = serde_json::from_str(&text).expect("JSON");
+            if answer["id"] == json!(self.n_calls) {
+                assert!(answer.get("error").is_none(), "{method}: {answer}");
+                return answer["result"].clone();
+            }
+        }
+    }
+
+    /// Value of a JavaScript expression.
+    pub(crate) fn evaluate(&mut self, expression: &str) -> Value {
+        let result = self.call("Runtime.evaluate", json!({"expression": expression, "returnByValue": true}));
+        assert!(result.get("exceptionDetails").is_none(), "{expression}: {result}");
+        result["result"]["value"].clone()
+    }
+
+    /// Text of the element with this id.
+    pub(crate) fn text(&mut self, id: &str) -> String {
+        let text = self.evaluate(&format!("document.getElementById('{id}')?.textContent ?? ''"));
+        text.as_str().unwrap_or_default().to_owned()
+    }
+
+    /// Clicks the element with this id.
+    pub(crate) fn click(&mut self, id: &str) {
+        self.evaluate(&format!("document.getElementById('{id}').click()"));
+    }
+
+    /// Moves the mouse; `kind` is `mousePressed`, `mouseMoved` or `mouseReleased`.
+    pub(crate) fn mouse(&mut self, kind: &str, [x, y]: [i32; 2]) {
+        let event = json!({"type": kind, "x": x, "y": y, "button": "left", "buttons": 1, "clickCount": 1});
+        self.call("Input.dispatchMouseEvent", event);
+    }
+
+    /// What the page looks like, as PNG.
+    pub(crate) fn screenshot(&mut self) -> Vec<u8> {
+        let shot = self.call("Page.captureScreenshot", json!({"format": "png"}));
+        bytes_from_base64(shot["data"].as_str().expect("base64"))
+    }
+}
+
+impl Drop for Browser {
+    fn drop(&mut self) {
+        // A browser that was asked to close also ends its own child processes.
+        self.session.clear();
+        let close = json!({"id": 0, "method": "Browser.close"});
+        let asked = self.socket.send(Message::text(close.to_string())).is_ok();
+        if !asked && self.process.kill().is_err() {
+            return;
+        }
+        let _ = self.process.wait();
+    }
+}
+
+fn bytes_from_base64(text: &str) -> Vec<u8> {
+    let sextet = |symbol: u8| match symbol {
+        b'A'..=b'Z' => u32::from(symbol - b'A'),
+        b'a'..=b'z' => u32::from(symbol - b'a') + 26,
+        b'0'..=b'9' => u32::from(symbol - b'0') + 52,
+        b'+' => 62,
+        _ => 63,
+    };
+    let symbols: Vec<u8> = text.bytes().filter(|symbol| *symbol != b'=').collect();
+    symbols
+        .chunks(4)
+        .flat_map(|group| {
+            let bits = group.iter().fold(0, |bits, symbol| bits << 6 | sextet(*symbol)) << (6 * (4 - group.len()));
+            bits.to_be_bytes()[1..group.len()].to_vec()
+        })
+        .collect()
+}

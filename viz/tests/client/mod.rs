@@ -1,0 +1,111 @@
+//! A blocking WebSocket client.
+
+use serde_json::Value;
+use std::net::{SocketAddr, TcpStream};
+use std::time::{Duration, Instant};
+use tungstenite::{Message, WebSocket};
+
+/// A connection to the server under test.
+pub(crate) struct Client {
+    socket: WebSocket<TcpStream>,
+}
+
+/// One message of the server.
+#[derive(Debug, PartialEq)]
+pub(crate) enum Received {
+    /// JSON text.
+    Text(Value),
+    /// JSON header and payload.
+    Binary(Value, Vec<u8>),
+    /// The connection is closed.
+    End,
+}
+
+impl Client {
+    pub(crate) fn connect(address: SocketAddr) -> Self {
+        let stream = TcpStream::connect(address).expect("the server listens");
+        stream.set_read_timeout(Some(super::PATIENCE)).expect("a timeout");
+        let (socket, _) = tungstenite::client(format!("ws://{address}/ws"), stream).expect("a WebSocket");
+        Self { socket }
+    }
+
+    pub(crate) fn say(&mut self, message: &Value) {
+        self.say_raw(Message::text(message.to_string()));
+    }
+
+    pub(crate) fn say_raw(&mut self, message: Message) {
+        self.socket.send(message).expect("sent");
+    }
+
+    /// Waits until the server has read all that was said so far.
+    pub(crate) fn settle(&mut self) {
+        self.say_raw(Message::text("settle?"));
+        self.text_of("error");
+    }
+
+    pub(crate) fn receive(&mut self) -> Received {
+        loop {
+            match self.socket.read() {
+                Ok(Message::Text(text)) => return Received::Text(serde_json::from_str(&text).expect("JSON")),
+                Ok(Message::Binary(bytes)) => return unframe(&bytes),
+                Ok(Message::Close(_)) => {}
+                Ok(_) => {}
+                Err(tungstenite::Error::ConnectionClosed | tungstenite::Error::Protocol(_)) => return Received::End,
+                Err(error) => panic!("the connection broke: {error}"),
+            }
+        }
+    }
+
+    /// The next message if it is text.
+    pub(crate) fn text(&mut self) -> Value {
+        match self.receive() {
+            Received::Text(value) => value,
+            other => panic!("text was expected, not {other:?}"),
+        }
+    }
+
+    /// The next text message of a type.
+    pub(crate) fn text_of(&mut self, kind: &str) -> Value {
+        self.until(|received| match received {
+            Received::Text(value) if value["type"] == kind => Some(value),
+            Received::End => panic!("the connection ended before a {kind:?} came"),
+            _ => None,
+        })
+    }
+
+    /// The next binary message of a type.
+    pub(crate) fn binary_of(&mut self, kind: &str) -> (Value, Vec<u8>) {
+        self.until(|received| match received {
+            Received::Binary(header, payload) if header["type"] == kind => Some((header, payload)),
+            Received::Text(value) if value["type"] == "error" => panic!("{value}"),
+            Received::End => panic!("the connection ended before a {kind:?} came"),
+            _ => None,
+        })
+    }
+
+    fn until<T>(&mut self, mut wanted: impl FnMut(Received) -> Option<T>) -> T {
+        let deadline = Instant::now() + super::PATIENCE + Duration::from_secs(1);
+        while Instant::now() < deadline {
+            if let Some(found) = wanted(self.receive()) {
+                return found;
+            }
+        }
+        panic!("the expected message did not come");
+    }
+}
+
+fn unframe(bytes: &[u8]) -> Received {
+    let (length, rest) = bytes.split_at(4);
+    let n_header = u32::from_le_bytes(length.try_into().expect("4 bytes")) as usize;
+    let (header, payload) = rest.split_at(n_header);
+    Received::Binary(serde_json::from_slice(header).expect("a JSON header"), payload.to_vec())
+}
+
+/// The bytes of one output of a picture.
+pub(crate) fn part<'a>(header: &Value, output: &str, payload: &'a [u8]) -> &'a [u8] {
+    let number = |name: &str| {
+        let number = header[output][name].as_u64().and_then(|n| usize::try_from(n).ok());
+        number.unwrap_or_else(|| panic!("{output}.{name} in {header}"))
+    };
+    &payload[number("offset")..number("offset") + number("bytes")]
+}

@@ -1,0 +1,287 @@
+//! Opens the bundled page in a real browser and compares what it shows with the exact scene.
+//!
+//! Skipped, and said so, where Chromium or the bundle (`make web`) is missing.
+
+mod analytic_scene;
+mod browser;
+
+use analytic_scene::{draw, looking_along_y};
+use browser::{Browser, chromium};
+use kinematics::{Stamp, Transform};
+use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+use trainer::{Projection, RenderRequest};
+use viz::{Hub, KeyframePose, LiveImage, LivePixels, SceneHint, Server, ServerConfig, Status};
+
+const WINDOW_PX: [u32; 2] = [1280, 760];
+/// Far more than two busy cores need to draw the page in software.
+const PATIENCE: Duration = Duration::from_secs(60);
+/// `--accent` of the page, the color of live cameras.
+const ACCENT: [u8; 3] = [0x4c, 0xc2, 0xa6];
+
+/// Draws requests on its own thread and keeps them, as a training thread would serve them.
+struct Painter {
+    requests: Arc<Mutex<Vec<RenderRequest>>>,
+    stop: Arc<AtomicBool>,
+    thread: Option<std::thread::JoinHandle<()>>,
+}
+
+impl Painter {
+    fn start(hub: Hub) -> Self {
+        let requests: Arc<Mutex<Vec<RenderRequest>>> = Arc::default();
+        let stop: Arc<AtomicBool> = Arc::default();
+        let (seen, stopped) = (Arc::clone(&requests), Arc::clone(&stop));
+        let thread = std::thread::spawn(move || {
+            while !stopped.load(Ordering::Relaxed) {
+                hub.wait_for_request(Duration::from_millis(50));
+                if let Some(pending) = hub.next_request() {
+                    seen.lock().expect("no panic holds it").push(pending.request.clone());
+                    let picture = draw(&pending.request);
+                    pending.deliver(picture);
+                }
+            }
+        });
+        Self { requests, stop, thread: Some(thread) }
+    }
+
+    fn requests(&self) -> Vec<RenderRequest> {
+        self.requests.lock().expect("no panic holds it").clone()
+    }
+}
+
+impl Drop for Painter {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            assert!(thread.join().is_ok() || std::thread::panicking(), "the painter panicked");
+        }
+    }
+}
+
+/// A camera that stands beside the scene, so that its frustum is seen from the first view.
+fn beside() -> KeyframePose {
+    let eye = Point3::new(-0.8, -0.3, 0.6);
+    let rotation = UnitQuaternion::face_towards(&(Point3::new(0.0, 0.2, 0.1) - eye), &-Vector3::z());
+    KeyframePose {
+        camera: "wrist".into(),
+        world_from_camera: Transform::from_parts(eye.into(), rotation),
+        size_px: [640, 480],
+        focal_px: [560.0, 560.0],
+        principal_px: [320.0, 240.0],
+    }
+}
+
+fn tell_news(hub: &Hub) {
+    let live = beside();
+    let request = RenderRequest {
+        world_from_camera: live.world_from_camera,
+        size_px: live.size_px,
+        projection: Projection::Pinhole { focal_px: live.focal_px, principal_px: live.principal_px },
+        shutter: None,
+        near_m: 0.01,
+        far_m: 50.0,
+        crop: None,
+        background_srgb: [0.1; 3],
+    };
+    hub.set_live_image(LiveImage {
+        camera: Arc::clone(&live.camera),
+        stamp: Stamp(1),
+        size_px: live.size_px,
+        pixels: LivePixels::Rgba(draw(&request).rgba_srgb.into()),
+        world_from_camera: Some(live.world_from_camera),
+        focal_px: live.focal_px,
+        principal_px: live.principal_px,
+    });
+    let turned = |angle: f64| Transform::rotation(Vector3::new(0.0, 0.0, angle)) * live.world_from_camera;
+    let keyframes = (1..12).map(|ix| KeyframePose { world_from_camera: turned(0.15 * f64::from(ix)), ..live.clone() });
+    hub.set_keyframes(keyframes.collect());
+    hub.set_scene_hint(SceneHint {
+        center_m: [0.0, 0.0, 0.2],
+        radius_m: 0.8,
+        world_from_camera: Translation3::new(0.0, 0.0, 0.3) * looking_along_y(),
+    });
+    let curve = |ix: u32| (f64::from(ix) * 2.0, 27.0 - 14.0 * (-f64::from(ix) / 12.0).exp());
+    hub.set_status(Status {
+        state: "training".to_owned(),
+        method: "splat".to_owned(),
+        seconds: 98.4,
+        step: 1520,
+        step_millis: Some(41.7),
+        primitives: 84_512,
+        bytes: 61_210_112,
+        keyframes: 143,
+        refused: BTreeMap::from([("too little motion".to_owned(), 812), ("blurred".to_owned(), 31)]),
+        psnr: Some(26.76),
+        psnr_history: (0..50).map(curve).collect(),
+        notes: Vec::new(),
+    });
+}
+
+#[test]
+fn the_page_shows_the_scene_where_it_is() {
+    let bundle = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("web/dist/app.js");
+    let Some(program) = chromium().filter(|_| bundle.is_file()) else {
+        eprintln!("page test skipped: it needs Chromium and the bundled page (make web)");
+        return;
+    };
+    let hub = Hub::new();
+    tell_news(&hub);
+    let server = Server::start(ServerConfig { listen: ([127, 0, 0, 1], 0).into() }, hub.clone()).expect("a free port");
+    let painter = Painter::start(hub.clone());
+    let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
+    let profile = scratch.join(format!("chromium-{}", std::process::id()));
+    let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
+
+    wait_for(&mut browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
+    std::fs::write(scratch.join("page.png"), browser.screenshot()).expect("written");
+    assert_eq!(browser.text("psnr"), "26.76");
+    assert_eq!(browser.text("primitives"), "84,512");
+    assert_eq!(browser.text("refused-total"), "843");
+    let at_rest = painter.requests();
+    let scales: Vec<_> = at_rest.iter().rev().take(3).rev().map(|request| request.size_px[0]).collect();
+    let full = at_rest.last().expect("drawn").clone();
+    assert!(scales[0] * 9 < scales[2] && scales[1] * 2 <= scales[2] + 1, "stages of 10, 50, 100 %: {scales:?}");
+    let first_view = Translation3::new(0.0, 0.0, 0.3) * looking_along_y();
+    assert!((full.world_from_camera.inverse() * first_view).translation.vector.norm() < 1e-6, "starts at the hint");
+
+    check_live_frustum(&mut browser, &full);
+    check_picture(&mut browser, &full);
+    check_drag(&mut browser, &painter, &full);
+    std::fs::write(scratch.join("page-dragged.png"), browser.screenshot()).expect("written");
+    check_reconnect(&mut browser, server, &hub);
+
+    drop(browser);
+    drop(painter);
+    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
+}
+
+/// The live camera's frustum is drawn where the request's projection puts it.
+fn check_live_frustum(browser: &mut Browser, request: &RenderRequest) {
+    const REACH_PX: i64 = 2; // Rounding to pixels, and lines one pixel wide.
+    let shot = canvas_shot(browser);
+    let camera = beside();
+    let depth = 1.6 * 0.12 * 0.8; // Of the drawn frustum: see web/src/overlays.ts.
+    let corner = |u: f64, v: f64| {
+        let at = |pixel: f64, focal: f64, principal: f64| (pixel - principal) / focal * depth;
+        camera.world_from_camera
+            * Point3::new(
+                at(u, camera.focal_px[0], camera.principal_px[0]),
+                at(v, camera.focal_px[1], camera.principal_px[1]),
+                depth,
+            )
+    };
+    let eye = Point3::from(camera.world_from_camera.translation.vector);
+    for (u, v) in [(0.0, 0.0), (640.0, 0.0), (640.0, 480.0), (0.0, 480.0)] {
+        for share in [0.3, 0.6, 0.9] {
+            let place = pixel_of(request, eye + (corner(u, v) - eye) * share);
+            let is_near = (-REACH_PX..=REACH_PX)
+                .flat_map(|dy| (-REACH_PX..=REACH_PX).map(move |dx| (place.0 + dx, place.1 + dy)))
+                .any(|(x, y)| pixel(&shot, x, y).iter().zip(ACCENT).all(|(a, b)| a.abs_diff(b) < 40));
+            assert!(is_near, "no line of the frustum near {place:?}");
+        }
+    }
+}
+
+/// With the lines off, the view is the picture of the request, pixel for pixel but for JPEG.
+fn check_picture(browser: &mut Browser, request: &RenderRequest) {
+    for id in ["toggle-grid", "toggle-frustums"] {
+        browser.click(id);
+    }
+    std::thread::sleep(Duration::from_millis(300));
+    let shot = canvas_shot(browser);
+    let expected = draw(request);
+    assert_eq!([shot.width(), shot.height()], expected.size_px);
+    let off_by = |dx: i64| {
+        let (mut sum, mut n) = (0.0, 0.0);
+        // Away from the edges, where toolbar and inset lie over the view.
+        for y in 80..i64::from(shot.height()) - 240 {
+            for x in (4..i64::from(shot.width()) - 4).step_by(3) {
+                let ix = usize::try_from(y * i64::from(shot.width()) + x).expect("inside") * 4;
+                let wanted = &expected.rgba_srgb[ix..ix + 3];
+                sum += pixel(&shot, x + dx, y).iter().zip(wanted).map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>();
+                n += 3.0;
+            }
+        }
+        sum / n
+    };
+    let (there, left, right) = (off_by(0), off_by(-2), off_by(2));
+    assert!(there < 3.0, "the view differs from the scene by {there} of 255 on average");
+    assert!(there < 0.7 * left && there < 0.7 * right, "a shift by 2 pixels must show: {there}, {left}, {right}");
+    for id in ["toggle-grid", "toggle-frustums"] {
+        browser.click(id);
+    }
+}
+
+/// Dragging asks for small pictures, resting for full ones, and the camera turns about the center.
+fn check_drag(browser: &mut Browser, painter: &Painter, before: &RenderRequest) {
+    let n_before = painter.requests().len();
+    browser.mouse("mousePressed", [300, 300]);
+    for ix in 0..12 {
+        browser.mouse("mouseMoved", [300 + 12 * ix, 300 - 4 * ix]);
+        std::thread::sleep(Duration::from_millis(30));
+    }
+    browser.mouse("mouseReleased", [432, 256]);
+    wait_for(browser, "a full picture after the drag", |_| {
+        let requests = painter.requests();
+        requests.len() > n_before + 3 && requests.last().is_some_and(|request| request.size_px == before.size_px)
+    });
+    let requests = painter.requests();
+    let first = &requests[n_before];
+    assert!(first.size_px[0] * 2 <= before.size_px[0] + 1, "a moving view is drawn small: {:?}", first.size_px);
+    let after = requests.last().expect("drawn");
+    let center = Point3::new(0.0, 0.0, 0.2);
+    let distance = |request: &RenderRequest| (request.world_from_camera.translation.vector - center.coords).norm();
+    let moved = (after.world_from_camera.translation.vector - before.world_from_camera.translation.vector).norm();
+    assert!(moved > 0.2, "the camera moved only {moved} m");
+    assert!((distance(after) - distance(before)).abs() < 0.3 && distance(after) > 1.0);
+    let right = after.world_from_camera.rotation * Vector3::x();
+    assert!(right.z.abs() < 1e-6, "the view stays upright");
+    wait_for(browser, "the full picture on screen", |browser| browser.text("picture-text").contains("100 %"));
+    std::thread::sleep(Duration::from_millis(300));
+}
+
+/// The page tells that the server is gone and comes back by itself.
+fn check_reconnect(browser: &mut Browser, server: Server, hub: &Hub) {
+    let listen = server.address();
+    drop(server);
+    wait_for(browser, "the loss", |browser| browser.text("connection").contains("the server stops"));
+    let server = Server::start(ServerConfig { listen }, hub.clone()).expect("the port is free again");
+    wait_for(browser, "the return", |browser| browser.text("connection").contains("connected"));
+    drop(server);
+}
+
+fn wait_for(browser: &mut Browser, what: &str, mut is_there: impl FnMut(&mut Browser) -> bool) {
+    let begun = Instant::now();
+    while !is_there(browser) {
+        assert!(begun.elapsed() < PATIENCE, "waited in vain for {what}");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+/// The part of the window that the view covers.
+fn canvas_shot(browser: &mut Browser) -> image::RgbImage {
+    let bounds = browser.evaluate("(() => { const b = document.getElementById('canvas').getBoundingClientRect(); return [b.x, b.y, b.width, b.height].map(Math.round) })()");
+    let bound = |ix: usize| bounds[ix].as_u64().and_then(|n| u32::try_from(n).ok()).expect("a bound");
+    let shot = image::load_from_memory_with_format(&browser.screenshot(), image::ImageFormat::Png).expect("a PNG");
+    shot.crop_imm(bound(0), bound(1), bound(2), bound(3)).to_rgb8()
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "pixels of a window")]
+fn pixel_of(request: &RenderRequest, point: Point3<f64>) -> (i64, i64) {
+    let Projection::Pinhole { focal_px, principal_px } = request.projection else {
+        panic!("the page asks for a pinhole")
+    };
+    let seen = request.world_from_camera.inverse_transform_point(&point);
+    let u = focal_px[0] * seen.x / seen.z + principal_px[0];
+    let v = focal_px[1] * seen.y / seen.z + principal_px[1];
+    (u.floor() as i64, v.floor() as i64)
+}
+
+fn pixel(image: &image::RgbImage, x: i64, y: i64) -> [u8; 3] {
+    let clamp = |at: i64, n: u32| u32::try_from(at.clamp(0, i64::from(n) - 1)).expect("inside");
+    image.get_pixel(clamp(x, image.width()), clamp(y, image.height())).0
+}

@@ -1,0 +1,364 @@
+//! Drives the real server over loopback as a stranger's program would, by `docs/protocol.md`.
+
+mod analytic_scene;
+mod client;
+
+use analytic_scene::draw;
+use client::{Client, Received};
+use kinematics::{Stamp, Transform};
+use nalgebra::{Translation3, Vector3};
+use serde_json::{Value, json};
+use std::io::{Read, Write};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use viz::{Error, Hub, KeyframePose, LiveImage, LivePixels, PendingRender, SceneHint, Server, ServerConfig, Status};
+
+/// Far more than loopback needs; a test that waits this long has failed.
+const PATIENCE: Duration = Duration::from_secs(20);
+
+fn start() -> (Hub, Server) {
+    let hub = Hub::new();
+    let server = Server::start(ServerConfig { listen: SocketAddr::from(([127, 0, 0, 1], 0)) }, hub.clone());
+    (hub, server.expect("a free port exists"))
+}
+
+fn render_message(id: u64) -> Value {
+    json!({
+        "type": "render", "id": id, "size_px": [160, 120],
+        "world_from_camera": [1, 0, 0, 0.0, 0, 0, 1, -2.0, 0, -1, 0, 0.5, 0, 0, 0, 1],
+        "projection": {"kind": "pinhole", "vertical_fov_rad": 0.9},
+    })
+}
+
+fn next(hub: &Hub) -> PendingRender {
+    assert!(hub.wait_for_request(PATIENCE), "no request came");
+    hub.next_request().expect("a request waits")
+}
+
+/// Draws and delivers every waiting stage.
+fn draw_all(hub: &Hub, n_stages: usize) {
+    for _ in 0..n_stages {
+        let pending = next(hub);
+        let picture = draw(&pending.request);
+        pending.deliver(picture);
+    }
+}
+
+#[test]
+fn a_client_is_greeted_with_the_version_and_told_the_news() {
+    let (hub, server) = start();
+    hub.set_status(Status {
+        state: "training".to_owned(),
+        step: 1200,
+        psnr: Some(24.5),
+        psnr_history: vec![(1.0, 20.0), (2.0, 24.5)],
+        refused: [("blurred".to_owned(), 3)].into(),
+        ..Status::default()
+    });
+    hub.set_scene_hint(SceneHint {
+        center_m: [0.4, 0.0, 0.1],
+        radius_m: 0.5,
+        world_from_camera: Translation3::new(1.0, 2.0, 3.0).into(),
+    });
+    hub.set_keyframes(vec![KeyframePose {
+        camera: "wrist".into(),
+        world_from_camera: Transform::identity(),
+        size_px: [640, 480],
+        focal_px: [600.0, 601.0],
+        principal_px: [320.0, 240.0],
+    }]);
+    let mut client = Client::connect(server.address());
+    let hello = client.text();
+    assert_eq!((&hello["type"], &hello["protocol"]), (&json!("hello"), &json!(viz::PROTOCOL_VERSION)));
+    assert_eq!(hello["default_stages"], json!([0.1, 0.5, 1.0]));
+    let scene = client.text_of("scene");
+    assert_eq!(scene["world_from_camera"], json!([1., 0., 0., 1., 0., 1., 0., 2., 0., 0., 1., 3., 0., 0., 0., 1.]));
+    let status = client.text_of("status");
+    assert_eq!((&status["step"], &status["psnr"]), (&json!(1200), &json!(24.5)));
+    assert_eq!(status["psnr_history"], json!([[1.0, 20.0], [2.0, 24.5]]));
+    assert_eq!(status["refused"], json!({"blurred": 3}));
+    let keyframes = client.text_of("keyframes");
+    assert_eq!(keyframes["keyframes"][0]["focal_px"], json!([600.0, 601.0]));
+    hub.set_status(Status { step: 1300, ..Status::default() });
+    assert_eq!(client.text_of("status")["step"], json!(1300));
+}
+
+#[test]
+fn stages_stream_as_they_are_drawn_and_show_the_scene() {
+    let (hub, server) = start();
+    let mut client = Client::connect(server.address());
+    let mut message = render_message(9);
+    message["outputs"] = json!(["color", "depth"]);
+    message["depth_format"] = json!("f32");
+    client.say(&message);
+    let mut sizes = Vec::new();
+    for stage in 0..3 {
+        draw_all(&hub, 1); // The stage arrives before the next one is drawn.
+        let (header, payload) = client.binary_of("picture");
+        assert_eq!((&header["id"], &header["stage"]), (&json!(9), &json!(stage)));
+        assert_eq!(header["last"], json!(stage == 2));
+        check_same_pose(&message["world_from_camera"], &header["world_from_camera"]);
+        sizes.push(header["size_px"].clone());
+        let color = client::part(&header, "color", &payload);
+        let picture = image::load_from_memory_with_format(color, image::ImageFormat::Jpeg).expect("a JPEG").to_rgb8();
+        assert_eq!(json!([picture.width(), picture.height()]), header["size_px"]);
+        let depth = client::part(&header, "depth", &payload);
+        check_against_scene(&request_of_stage(&message, &header), &picture, depth);
+    }
+    assert_eq!(sizes, [json!([16, 12]), json!([80, 60]), json!([160, 120])]);
+    assert!(hub.next_request().is_none(), "all stages are drawn");
+}
+
+/// The server keeps a quaternion, so that a matrix comes back with a few roundings.
+fn check_same_pose(sent: &Value, came_back: &Value) {
+    let numbers =
+        |value: &Value| value.as_array().map(|rows| rows.iter().filter_map(Value::as_f64).collect::<Vec<_>>());
+    let (sent, came_back) = (numbers(sent).expect("numbers"), numbers(came_back).expect("numbers"));
+    assert_eq!((sent.len(), came_back.len()), (16, 16));
+    assert!(sent.iter().zip(&came_back).all(|(a, b)| (a - b).abs() < 1e-12), "{sent:?} became {came_back:?}");
+}
+
+/// The request of a stage as its header tells it, through nothing but the wire.
+fn request_of_stage(message: &Value, header: &Value) -> trainer::RenderRequest {
+    let numbers =
+        |value: &Value| value.as_array().map(|list| list.iter().filter_map(Value::as_f64).collect::<Vec<_>>());
+    let scale = header["size_px"][0].as_f64().expect("a size") / header["full_size_px"][0].as_f64().expect("a size");
+    let focal = numbers(&header["projection"]["focal_px"]).expect("focal lengths");
+    let principal = numbers(&header["projection"]["principal_px"]).expect("a principal point");
+    assert_eq!(message["size_px"], header["full_size_px"]);
+    let size_px = [0, 1].map(|ix| header["size_px"][ix].as_u64().and_then(|n| u32::try_from(n).ok()).expect("a size"));
+    trainer::RenderRequest {
+        world_from_camera: analytic_scene::looking_along_y(),
+        size_px,
+        projection: trainer::Projection::Pinhole {
+            focal_px: [focal[0] * scale, focal[1] * scale],
+            principal_px: [principal[0] * scale, principal[1] * scale],
+        },
+        shutter: None,
+        near_m: header["near_m"].as_f64().expect("near"),
+        far_m: header["far_m"].as_f64().expect("far"),
+        crop: None,
+        background_srgb: [0.0; 3],
+    }
+}
+
+fn check_against_scene(request: &trainer::RenderRequest, picture: &image::RgbImage, depth: &[u8]) {
+    let expected = draw(request);
+    // JPEG at these qualities; a picture that is mirrored, shifted or of another stage is off by tens.
+    const MEAN_ABS: f64 = 6.0;
+    let colors = expected.rgba_srgb.chunks_exact(4).flat_map(|pixel| &pixel[..3]);
+    let off: f64 = colors.zip(picture.as_raw()).map(|(a, b)| f64::from(a.abs_diff(*b))).sum();
+    let mean_off = off / f64::from(3 * picture.width() * picture.height());
+    assert!(mean_off < MEAN_ABS, "colors differ by {mean_off} on average");
+    let depth: Vec<f32> = depth.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+    assert_eq!(depth.len(), expected.depth_m.len());
+    let worst = depth.iter().zip(&expected.depth_m).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    // The focal length travelled as text and was scaled once more: nothing but rounding may differ.
+    assert!(worst < 1e-5, "depths differ by up to {worst} m");
+}
+
+#[test]
+fn a_newer_request_replaces_what_was_not_begun() {
+    let (hub, server) = start();
+    let mut client = Client::connect(server.address());
+    client.say(&render_message(1));
+    let begun = next(&hub);
+    client.say(&render_message(2));
+    client.say(&render_message(3));
+    client.settle(); // The server answers in order, so the requests have arrived.
+    let picture = draw(&begun.request);
+    begun.deliver(picture);
+    draw_all(&hub, 3);
+    let drawn: Vec<_> = (0..4)
+        .map(|_| client.binary_of("picture").0)
+        .map(|header| (header["id"].as_u64(), header["stage"].as_u64()))
+        .collect();
+    assert_eq!(drawn, [(Some(1), Some(0)), (Some(3), Some(0)), (Some(3), Some(1)), (Some(3), Some(2))]);
+    assert!(hub.next_request().is_none());
+}
+
+#[test]
+fn two_clients_are_served_in_turn_and_a_leaver_costs_nothing() {
+    let (hub, server) = start();
+    let mut first = Client::connect(server.address());
+    let mut second = Client::connect(server.address());
+    first.say(&render_message(10));
+    second.say(&render_message(20));
+    first.settle();
+    second.settle();
+    assert_eq!(hub.n_clients(), 2);
+    draw_all(&hub, 2); // One stage each, whoever asked first.
+    assert_eq!(first.binary_of("picture").0["id"], json!(10));
+    assert_eq!(second.binary_of("picture").0["id"], json!(20));
+    drop(first);
+    wait_until(|| hub.n_clients() == 1);
+    draw_all(&hub, 2);
+    assert_eq!(second.binary_of("picture").0["stage"], json!(1));
+    assert_eq!(second.binary_of("picture").0["stage"], json!(2));
+    assert!(hub.next_request().is_none(), "nobody waits for the rest of the leaver's stages");
+}
+
+#[test]
+fn a_malformed_message_gets_a_sentence_and_the_connection_stays() {
+    let (hub, server) = start();
+    let mut client = Client::connect(server.address());
+    let mut wrong_size = render_message(31);
+    wrong_size["size_px"] = json!([100_000, 10]);
+    let mut wrong_pose = render_message(32);
+    wrong_pose["world_from_camera"] = json!(vec![0; 16]);
+    let cases = [
+        ("{".to_owned(), Value::Null, "not understood"),
+        ("[]".to_owned(), Value::Null, "not understood"),
+        (json!({"type": "dance"}).to_string(), Value::Null, "dance"),
+        (json!({"type": "render", "id": 30}).to_string(), json!(30), "missing field"),
+        (render_message(33).to_string().replace("-2.0", "1e999"), Value::Null, "number out of range"),
+        (wrong_size.to_string(), json!(31), "size_px"),
+        (wrong_pose.to_string(), json!(32), "world_from_camera"),
+    ];
+    for (message, id, named) in cases {
+        client.say_raw(tungstenite::Message::text(message.clone()));
+        let error = client.text_of("error");
+        assert_eq!(error["id"], id, "{message}");
+        let sentence = error["message"].as_str().unwrap_or_default();
+        assert!(sentence.contains(named) && !sentence.contains('\n'), "{message}: {sentence}");
+    }
+    client.say_raw(tungstenite::Message::binary(vec![0, 1, 2]));
+    assert!(client.text_of("error")["message"].as_str().is_some_and(|text| text.contains("binary")));
+    client.say(&render_message(34));
+    draw_all(&hub, 3);
+    assert_eq!(client.binary_of("picture").0["id"], json!(34));
+}
+
+#[test]
+fn a_picture_that_cannot_be_drawn_is_an_error_message() {
+    let (hub, server) = start();
+    let mut client = Client::connect(server.address());
+    client.say(&render_message(5));
+    next(&hub).fail("the GPU is lost");
+    let error = client.text_of("error");
+    assert_eq!((&error["id"], &error["message"]), (&json!(5), &json!("the GPU is lost")));
+    let pending = next(&hub);
+    let mut picture = draw(&pending.request);
+    picture.rgba_srgb.truncate(7);
+    pending.deliver(picture);
+    assert!(client.text_of("error")["message"].as_str().is_some_and(|text| text.contains("has 7")));
+    drop(next(&hub)); // Given up silently: the client's later requests are served all the same.
+    client.say(&render_message(6));
+    draw_all(&hub, 3);
+    assert_eq!(client.binary_of("picture").0["id"], json!(6));
+}
+
+#[test]
+fn live_images_reach_every_client_once_as_jpeg() {
+    let (hub, server) = start();
+    let gradient: Arc<[u8]> =
+        (0..64 * 48_u32).flat_map(|ix| [u8::try_from(ix % 64 * 4).unwrap_or(255), 80, 20, 255]).collect();
+    let image = |stamp| LiveImage {
+        camera: "wrist".into(),
+        stamp: Stamp(stamp),
+        size_px: [64, 48],
+        pixels: LivePixels::Rgba(Arc::clone(&gradient)),
+        world_from_camera: Some(Transform::identity()),
+        focal_px: [60.0, 60.0],
+        principal_px: [32.0, 24.0],
+    };
+    hub.set_live_image(image(5));
+    let mut clients = [Client::connect(server.address()), Client::connect(server.address())];
+    for client in &mut clients {
+        let (header, jpeg) = client.binary_of("live_image");
+        assert_eq!((&header["camera"], &header["stamp_nanos"]), (&json!("wrist"), &json!(5)));
+        let picture = image::load_from_memory_with_format(&jpeg, image::ImageFormat::Jpeg).expect("a JPEG").to_rgb8();
+        assert!(picture.get_pixel(60, 20)[0].abs_diff(240) < 16, "{:?}", picture.get_pixel(60, 20));
+    }
+    hub.set_live_image(image(6));
+    hub.set_live_image(image(7));
+    for client in &mut clients {
+        let stamp = client.binary_of("live_image").0["stamp_nanos"].clone();
+        assert!(stamp == json!(6) || stamp == json!(7), "{stamp}");
+    }
+}
+
+#[test]
+fn another_version_is_sent_away_and_the_same_is_welcome() {
+    let (_hub, server) = start();
+    let mut client = Client::connect(server.address());
+    client.say(&json!({"type": "hello", "protocol": viz::PROTOCOL_VERSION}));
+    client.settle();
+    client.say(&json!({"type": "hello", "protocol": 999}));
+    assert!(client.text_of("goodbye")["reason"].as_str().is_some_and(|reason| reason.contains("999")));
+    assert_eq!(client.receive(), Received::End);
+}
+
+#[test]
+fn a_stopping_server_says_goodbye_and_frees_the_port() {
+    let (hub, server) = start();
+    let address = server.address();
+    let mut client = Client::connect(address);
+    client.settle();
+    drop(server);
+    assert_eq!(client.text_of("goodbye")["reason"], json!("the server stops"));
+    assert_eq!(client.receive(), Received::End);
+    assert_eq!(hub.n_clients(), 0);
+    drop(Server::start(ServerConfig { listen: address }, hub).expect("the port is free again"));
+}
+
+#[test]
+fn a_taken_port_and_a_public_address_are_refused_in_one_sentence() {
+    let holder = TcpListener::bind("127.0.0.1:0").expect("a free port exists");
+    let taken = holder.local_addr().expect("bound");
+    let error = Server::start(ServerConfig { listen: taken }, Hub::new()).expect_err("taken");
+    assert!(matches!(error, Error::AddressInUse { address } if address == taken));
+    assert!(error.to_string().contains(&taken.to_string()), "{error}");
+    let public: SocketAddr = "0.0.0.0:0".parse().expect("an address");
+    let error = Server::start(ServerConfig { listen: public }, Hub::new()).expect_err("public");
+    assert!(matches!(error, Error::NotLoopback { .. }) && error.to_string().contains("TLS"), "{error}");
+}
+
+#[test]
+fn the_page_and_the_status_are_served_over_http() {
+    let (hub, server) = start();
+    hub.set_status(Status { step: 77, ..Status::default() });
+    let page = get(server.address(), "/", "localhost");
+    assert!(page.starts_with("HTTP/1.1 200") && page.contains("fieldrig"), "{page}");
+    let status = get(server.address(), "/status", "localhost");
+    let body = status.split("\r\n\r\n").nth(1).expect("a body");
+    assert_eq!(serde_json::from_str::<Value>(body).expect("JSON")["step"], json!(77));
+    assert!(get(server.address(), "/nothing", "localhost").starts_with("HTTP/1.1 404"));
+    assert!(get(server.address(), "/status", "example.com").starts_with("HTTP/1.1 403"));
+}
+
+fn get(address: SocketAddr, path: &str, host: &str) -> String {
+    let mut stream = TcpStream::connect(address).expect("the server listens");
+    stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
+    write!(stream, "GET {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n").expect("sent");
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer).expect("an answer");
+    String::from_utf8_lossy(&answer).into_owned()
+}
+
+fn wait_until(is_done: impl Fn() -> bool) {
+    let begun = Instant::now();
+    while !is_done() {
+        assert!(begun.elapsed() < PATIENCE, "waited in vain");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+#[test]
+fn the_analytic_scene_tells_left_from_right_and_up_from_down() {
+    let request = request_of_stage(
+        &json!({"size_px": [80, 60]}),
+        &json!({"size_px": [80, 60], "full_size_px": [80, 60], "near_m": 0.01, "far_m": 100.0,
+                "projection": {"focal_px": [60.0, 60.0], "principal_px": [40.0, 30.0]}}),
+    );
+    let picture = draw(&request);
+    let mirrored: Vec<u8> = picture
+        .rgba_srgb
+        .chunks_exact(4 * 80)
+        .flat_map(|row| row.chunks_exact(4).rev().flatten().copied().collect::<Vec<_>>())
+        .collect();
+    assert_ne!(mirrored, picture.rgba_srgb);
+    let in_world = request.world_from_camera.rotation * Vector3::new(0.0, -1.0, 0.0);
+    assert!((in_world - Vector3::z()).norm() < 1e-12, "the camera's up is the world's");
+}

@@ -1,0 +1,140 @@
+// Accuracy over time as a line on a canvas.
+
+const MARGIN = { left: 30, right: 8, top: 8, bottom: 18 };
+const MIN_SPAN_DB = 2;
+
+export class Chart {
+  private points: [number, number][] = [];
+  private hovered: number | null = null;
+
+  constructor(private readonly canvas: HTMLCanvasElement) {
+    new ResizeObserver(() => this.draw()).observe(canvas);
+    canvas.addEventListener("pointermove", (event) => {
+      this.hovered = event.offsetX;
+      this.draw();
+    });
+    canvas.addEventListener("pointerleave", () => {
+      this.hovered = null;
+      this.draw();
+    });
+  }
+
+  set(points: [number, number][]): void {
+    this.points = points.filter(([x, y]) => Number.isFinite(x) && Number.isFinite(y));
+    this.draw();
+  }
+
+  private draw(): void {
+    const { canvas } = this;
+    const width = canvas.clientWidth;
+    const height = canvas.clientHeight;
+    const context = canvas.getContext("2d");
+    if (!context || width === 0) return;
+    canvas.width = Math.round(width * devicePixelRatio);
+    canvas.height = Math.round(height * devicePixelRatio);
+    context.scale(devicePixelRatio, devicePixelRatio);
+    const style = getComputedStyle(document.documentElement);
+    const color = (name: string): string => style.getPropertyValue(name).trim();
+    context.font = `11px ${style.fontFamily}`;
+    if (this.points.length === 0) {
+      context.fillStyle = color("--dim");
+      context.textAlign = "center";
+      context.fillText("after the first evaluation", width / 2, height / 2);
+      return;
+    }
+    const xMax = Math.max(1, this.points[this.points.length - 1]![0]);
+    const [yMin, yMax] = spanOf(this.points.map((point) => point[1]));
+    const x = (value: number): number => MARGIN.left + (value / xMax) * (width - MARGIN.left - MARGIN.right);
+    const y = (value: number): number =>
+      height - MARGIN.bottom - ((value - yMin) / (yMax - yMin)) * (height - MARGIN.top - MARGIN.bottom);
+
+    context.lineWidth = 1;
+    context.strokeStyle = color("--line");
+    context.fillStyle = color("--dim");
+    context.textAlign = "right";
+    context.textBaseline = "middle";
+    for (const tick of ticks(yMin, yMax, 4)) {
+      line(context, [[MARGIN.left, y(tick)], [width - MARGIN.right, y(tick)]]);
+      context.fillText(String(tick), MARGIN.left - 6, y(tick));
+    }
+    context.textBaseline = "alphabetic";
+    for (const tick of ticks(0, xMax, 4)) {
+      context.textAlign = x(tick) > width - 24 ? "right" : tick === 0 ? "left" : "center";
+      context.fillText(timeText(tick), x(tick), height - 4);
+    }
+
+    const path = this.points.map(([seconds, psnr]) => [x(seconds), y(psnr)] as const);
+    context.strokeStyle = color("--accent");
+    context.lineWidth = 1.75;
+    context.lineJoin = "round";
+    line(context, path);
+    const marked = this.nearest(x) ?? this.points.length - 1;
+    this.mark(context, path[marked]!, this.points[marked]!, color);
+  }
+
+  /** Index of the point under the pointer. */
+  private nearest(x: (seconds: number) => number): number | null {
+    const pointer = this.hovered;
+    if (pointer === null) return null;
+    let best = 0;
+    this.points.forEach(([seconds], ix) => {
+      if (Math.abs(x(seconds) - pointer) < Math.abs(x(this.points[best]![0]) - pointer)) best = ix;
+    });
+    return best;
+  }
+
+  private mark(
+    context: CanvasRenderingContext2D,
+    [px, py]: readonly [number, number],
+    [seconds, psnr]: [number, number],
+    color: (name: string) => string,
+  ): void {
+    context.fillStyle = color("--accent");
+    context.beginPath();
+    context.arc(px, py, 3.5, 0, 2 * Math.PI);
+    context.fill();
+    if (this.hovered === null) return;
+    const text = `${psnr.toFixed(2)} dB at ${timeText(seconds)}`;
+    const half = context.measureText(text).width / 2;
+    const middle = Math.min(Math.max(px, MARGIN.left + half), this.canvas.clientWidth - MARGIN.right - half);
+    const above = py > 30 ? py - 12 : py + 20;
+    context.fillStyle = color("--raised");
+    context.fillRect(middle - half - 4, above - 11, 2 * half + 8, 15);
+    context.fillStyle = color("--text");
+    context.textAlign = "center";
+    context.fillText(text, middle, above);
+  }
+}
+
+function line(context: CanvasRenderingContext2D, points: readonly (readonly [number, number])[]): void {
+  context.beginPath();
+  points.forEach(([px, py], ix) => (ix === 0 ? context.moveTo(px, py) : context.lineTo(px, py)));
+  context.stroke();
+}
+
+/** Range of the values with a little air, not narrower than a noisy flat curve needs. */
+function spanOf(values: number[]): [number, number] {
+  const min = Math.min(...values);
+  const max = Math.max(...values);
+  const air = Math.max(0.06 * (max - min), (MIN_SPAN_DB - (max - min)) / 2, 0.1);
+  return [min - air, max + air];
+}
+
+/** Round numbers between two values, about `n` of them. */
+function ticks(min: number, max: number, n: number): number[] {
+  const rough = (max - min) / n;
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const size = [1, 2, 5, 10].map((factor) => factor * power).find((candidate) => candidate >= rough)!;
+  const found = [];
+  for (let ix = Math.ceil(min / size); ix * size <= max; ix += 1) found.push(Number((ix * size).toPrecision(6)));
+  return found;
+}
+
+/** Seconds as a person says them. */
+export function timeText(seconds: number): string {
+  if (seconds < 120) return `${Number(seconds.toFixed(seconds < 10 ? 1 : 0))} s`;
+  const minutes = Math.floor(seconds / 60);
+  const rest = Math.round(seconds - 60 * minutes);
+  if (minutes < 60) return rest ? `${minutes} min ${rest} s` : `${minutes} min`;
+  return `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
+}

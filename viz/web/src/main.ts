@@ -1,0 +1,114 @@
+// The operator's page: joins the connection, the view and the readouts.
+
+import { Connection } from "./connection";
+import { element } from "./element";
+import { LiveImages } from "./live_images";
+import { BACKGROUND, OrbitView } from "./orbit_view";
+import type { BinaryHeader, LiveImageHeader, PictureHeader, TextMessage } from "./protocol";
+import { Readouts } from "./readouts";
+import { RenderAsker } from "./render_asker";
+
+let stages = [0.1, 0.5, 1];
+let latestStep = -1;
+let liveCamera: LiveImageHeader | null = null;
+
+const readouts = new Readouts();
+const liveImages = new LiveImages();
+const view = new OrbitView(element("canvas", HTMLCanvasElement), () => asker.moved());
+const connection = new Connection(`ws://${location.host}/ws`, {
+  state(state, text) {
+    element("connection").dataset.state = state;
+    element("connection").textContent = text;
+    if (state === "open") {
+      view.picture.forget();
+      asker.restart();
+    }
+  },
+  text: receiveText,
+  binary: receiveBinary,
+});
+const asker = new RenderAsker(connection, () => view.view(), () => stages, BACKGROUND);
+
+function receiveText(message: TextMessage): void {
+  switch (message.type) {
+    case "hello":
+      stages = message.default_stages;
+      break;
+    case "status":
+      readouts.show(message);
+      if (message.step !== latestStep) asker.learned();
+      latestStep = message.step;
+      break;
+    case "scene":
+      view.setScene(message);
+      break;
+    case "keyframes":
+      view.overlays.setKeyframes(message.keyframes);
+      break;
+    case "error":
+      asker.failed(message.id);
+      element("notice").textContent = message.message;
+      break;
+    case "goodbye":
+      break;
+  }
+}
+
+function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): void {
+  if (header.type === "picture") {
+    void showPicture(header, payload);
+  } else {
+    void liveImages.show(header, payload);
+    if (header.world_from_camera) {
+      liveCamera = header;
+      element("look-live", HTMLButtonElement).disabled = false;
+      view.overlays.setLiveCamera({ ...header, world_from_camera: header.world_from_camera });
+    }
+  }
+}
+
+async function showPicture(header: PictureHeader, payload: Uint8Array<ArrayBuffer>): Promise<void> {
+  const millis = asker.answered(header);
+  if (!(await view.picture.show(header, payload, view.emptyDepth))) return;
+  element("notice").textContent = "";
+  const [width, height] = header.size_px;
+  const percent = Math.round(100 * header.scale);
+  element("picture-text").textContent = `${width} × ${height} (${percent} %) in ${millis.toFixed(0)} ms`;
+  document.querySelectorAll(".stages i").forEach((mark, ix) => {
+    mark.classList.toggle("done", header.scale >= (stages[ix] ?? 1) - 1e-9);
+  });
+}
+
+function toggle(id: string, key: string, apply: (isOn: boolean) => void): void {
+  const button = element(id, HTMLButtonElement);
+  const flip = (): void => {
+    const isOn = button.getAttribute("aria-pressed") !== "true";
+    button.setAttribute("aria-pressed", String(isOn));
+    apply(isOn);
+  };
+  action(id, key, flip);
+}
+
+function action(id: string, key: string, act: () => void): void {
+  element(id).addEventListener("click", act);
+  window.addEventListener("keydown", (event) => {
+    const isPlain = !event.ctrlKey && !event.metaKey && !event.altKey && !event.repeat;
+    if (isPlain && event.key.toLowerCase() === key) act();
+  });
+}
+
+action("reset-view", "r", () => view.reset());
+action("look-live", "c", () => {
+  if (liveCamera?.world_from_camera) view.lookFrom(liveCamera.world_from_camera);
+});
+element("look-live", HTMLButtonElement).disabled = true;
+toggle("toggle-grid", "g", (isOn) => (view.overlays.showsGround = isOn));
+toggle("toggle-frustums", "k", (isOn) => (view.overlays.showsFrustums = isOn));
+toggle("toggle-occlude", "o", (isOn) => (view.picture.occludes = isOn));
+
+function frame(): void {
+  asker.tick();
+  view.draw();
+  requestAnimationFrame(frame);
+}
+requestAnimationFrame(frame);

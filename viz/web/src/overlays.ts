@@ -1,0 +1,96 @@
+// Lines over the picture: the floor grid, the world's axes, frustums of keyframes and live cameras.
+
+import * as THREE from "three";
+import { worldFromCamera } from "./convention";
+import type { PosedCamera, Scene } from "./protocol";
+
+const KEYFRAME_COLOR = 0xe8edf3;
+const LIVE_COLOR = 0x4cc2a6;
+
+export class Overlays {
+  readonly root = new THREE.Group();
+  private readonly ground = new THREE.Group();
+  private readonly frustums = new THREE.Group();
+  private readonly keyframes = lines(KEYFRAME_COLOR, 0.35);
+  private readonly live = new Map<string, THREE.LineSegments>();
+  private frustumDepth = 0.06;
+
+  constructor() {
+    this.frustums.add(this.keyframes);
+    this.root.add(this.ground, this.frustums);
+  }
+
+  set showsGround(visible: boolean) {
+    this.ground.visible = visible;
+  }
+
+  set showsFrustums(visible: boolean) {
+    this.frustums.visible = visible;
+  }
+
+  /** Lays grid and axes for a scene of this size. */
+  setScene(scene: Scene): void {
+    this.frustumDepth = 0.12 * scene.radius_m;
+    // A round cell size near a fifth of the radius.
+    const cell = 10 ** Math.round(Math.log10(scene.radius_m / 5));
+    const nCells = 2 * Math.ceil((1.6 * scene.radius_m) / cell);
+    for (const child of this.ground.children) (child as THREE.LineSegments).geometry.dispose();
+    this.ground.clear();
+    const grid = new THREE.GridHelper(nCells * cell, nCells, 0x9fb0c3, 0x9fb0c3);
+    grid.rotateX(Math.PI / 2);
+    const middle = [scene.center_m[0], scene.center_m[1]].map((value) => Math.round(value / cell) * cell);
+    grid.position.set(middle[0]!, middle[1]!, 0);
+    Object.assign(grid.material, { transparent: true, opacity: 0.22, depthWrite: false });
+    this.ground.add(grid, axes(2 * cell));
+  }
+
+  setKeyframes(keyframes: PosedCamera[]): void {
+    setLines(this.keyframes, keyframes.flatMap((keyframe) => frustum(keyframe, this.frustumDepth)));
+  }
+
+  setLiveCamera(camera: PosedCamera): void {
+    let drawn = this.live.get(camera.camera);
+    if (!drawn) {
+      drawn = lines(LIVE_COLOR, 1);
+      this.live.set(camera.camera, drawn);
+      this.frustums.add(drawn);
+    }
+    setLines(drawn, frustum(camera, 1.6 * this.frustumDepth));
+  }
+}
+
+function lines(color: number, opacity: number): THREE.LineSegments {
+  const material = new THREE.LineBasicMaterial({ color, opacity, transparent: true, depthWrite: false });
+  const segments = new THREE.LineSegments(new THREE.BufferGeometry(), material);
+  segments.frustumCulled = false;
+  return segments;
+}
+
+function setLines(target: THREE.LineSegments, points: THREE.Vector3[]): void {
+  target.geometry.dispose();
+  target.geometry = new THREE.BufferGeometry().setFromPoints(points);
+}
+
+/** x red, y green, z blue. */
+function axes(length: number): THREE.LineSegments {
+  const helper = new THREE.AxesHelper(length);
+  helper.setColors(0xf0716a, 0x7bd88f, 0x6cb6ff);
+  helper.renderOrder = 1;
+  return helper;
+}
+
+/** Ends of the edges of a frustum and of a short stroke on its upper side, in world. */
+function frustum(camera: PosedCamera, depth: number): THREE.Vector3[] {
+  const pose = worldFromCamera(camera.world_from_camera);
+  const [width, height] = camera.size_px;
+  const at = (u: number, v: number): THREE.Vector3 =>
+    new THREE.Vector3(
+      ((u - camera.principal_px[0]) / camera.focal_px[0]) * depth,
+      ((v - camera.principal_px[1]) / camera.focal_px[1]) * depth,
+      depth,
+    ).applyMatrix4(pose);
+  const eye = new THREE.Vector3().applyMatrix4(pose);
+  const corners = [at(0, 0), at(width, 0), at(width, height), at(0, height)];
+  const edges = corners.flatMap((corner, ix) => [eye, corner, corner, corners[(ix + 1) % 4]!]);
+  return [...edges, at(0.4 * width, -0.12 * height), at(0.6 * width, -0.12 * height)];
+}

@@ -1,0 +1,125 @@
+// The messages of docs/protocol.md, version 1.
+
+/** Version this page was written for. */
+export const PROTOCOL_VERSION = 1;
+
+export interface Pinhole {
+  kind: "pinhole";
+  focal_px: [number, number];
+  principal_px: [number, number];
+}
+
+export interface Hello {
+  type: "hello";
+  protocol: number;
+  server: string;
+  client: number;
+  max_size_px: [number, number];
+  default_stages: number[];
+}
+
+export interface Status {
+  type: "status";
+  state: string;
+  method: string;
+  seconds: number;
+  step: number;
+  step_millis: number | null;
+  primitives: number;
+  bytes: number;
+  keyframes: number;
+  refused: Record<string, number>;
+  psnr: number | null;
+  psnr_history: [number, number][];
+  notes: string[];
+}
+
+export interface Scene {
+  type: "scene";
+  center_m: [number, number, number];
+  radius_m: number;
+  world_from_camera: number[];
+}
+
+/** Pose and lens of a camera at one moment; enough to draw its frustum. */
+export interface PosedCamera {
+  camera: string;
+  world_from_camera: number[];
+  size_px: [number, number];
+  focal_px: [number, number];
+  principal_px: [number, number];
+}
+
+export interface Keyframes {
+  type: "keyframes";
+  keyframes: PosedCamera[];
+}
+
+export interface ErrorMessage {
+  type: "error";
+  id: number | null;
+  message: string;
+}
+
+export interface Goodbye {
+  type: "goodbye";
+  reason: string;
+}
+
+export interface PictureHeader {
+  type: "picture";
+  id: number;
+  stage: number;
+  n_stages: number;
+  scale: number;
+  last: boolean;
+  size_px: [number, number];
+  full_size_px: [number, number];
+  world_from_camera: number[];
+  projection: Pinhole | { kind: "equirectangular" };
+  near_m: number;
+  far_m: number;
+  render_millis: number;
+  color: { format: "jpeg"; offset: number; bytes: number } | null;
+  depth: {
+    format: "u16_half" | "f32";
+    size_px: [number, number];
+    metres_per_count: number;
+    offset: number;
+    bytes: number;
+  } | null;
+}
+
+export interface LiveImageHeader {
+  type: "live_image";
+  camera: string;
+  stamp_nanos: number;
+  size_px: [number, number];
+  format: "jpeg";
+  world_from_camera: number[] | null;
+  focal_px: [number, number];
+  principal_px: [number, number];
+}
+
+export type TextMessage = Hello | Status | Scene | Keyframes | ErrorMessage | Goodbye;
+export type BinaryHeader = PictureHeader | LiveImageHeader;
+
+export interface RenderMessage {
+  type: "render";
+  id: number;
+  world_from_camera: number[];
+  size_px: [number, number];
+  projection: Pinhole;
+  stages: number[];
+  near_m: number;
+  far_m: number;
+  outputs: ("color" | "depth")[];
+  background_srgb: [number, number, number];
+}
+
+/** Header and payload of a binary message: u32 little-endian header length, JSON header, payload. */
+export function unframe(message: ArrayBuffer): { header: BinaryHeader; payload: Uint8Array<ArrayBuffer> } {
+  const nHeader = new DataView(message).getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(message, 4, nHeader))) as BinaryHeader;
+  return { header, payload: new Uint8Array(message, 4 + nHeader) };
+}

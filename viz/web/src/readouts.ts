@@ -1,0 +1,52 @@
+// Numbers of the run as text.
+
+import { Chart, timeText } from "./chart";
+import { element } from "./element";
+import type { Status } from "./protocol";
+
+const PRIMITIVE_NAMES: Record<string, string> = { splat: "Splats", tsdf: "Voxel blocks", nerf: "Table entries" };
+
+export class Readouts {
+  private readonly chart = new Chart(element("chart", HTMLCanvasElement));
+
+  show(status: Status): void {
+    text("state", status.state);
+    text("method", status.method);
+    text("psnr", status.psnr === null ? "–" : status.psnr.toFixed(2));
+    text("seconds", timeText(status.seconds));
+    text("step", count(status.step));
+    text("step-millis", status.step_millis === null ? "–" : `${status.step_millis.toPrecision(3)} ms`);
+    text("primitives-name", PRIMITIVE_NAMES[status.method] ?? "Primitives");
+    text("primitives", count(status.primitives));
+    text("bytes", bytesText(status.bytes));
+    text("keyframes", count(status.keyframes));
+    const reasons = Object.entries(status.refused).sort((a, b) => b[1] - a[1]);
+    text("refused-total", count(reasons.reduce((sum, [, n]) => sum + n, 0)));
+    element("refused").replaceChildren(
+      ...reasons.flatMap(([reason, n]) => [child("dt", reason), child("dd", count(n))]),
+    );
+    element("notes-card").hidden = status.notes.length === 0;
+    element("notes").replaceChildren(...status.notes.map((note) => child("li", note)));
+    this.chart.set(status.psnr_history);
+  }
+}
+
+function text(id: string, value: string): void {
+  element(id).textContent = value;
+}
+
+function child(tag: string, value: string): HTMLElement {
+  const made = document.createElement(tag);
+  made.textContent = value;
+  return made;
+}
+
+function count(n: number): string {
+  return n.toLocaleString("en-US");
+}
+
+function bytesText(bytes: number): string {
+  if (bytes < 1024 * 1024) return `${(bytes / 1024).toFixed(0)} KiB`;
+  if (bytes < 1024 ** 3) return `${(bytes / 1024 ** 2).toFixed(1)} MiB`;
+  return `${(bytes / 1024 ** 3).toFixed(2)} GiB`;
+}

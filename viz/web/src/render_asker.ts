@@ -1,0 +1,115 @@
+// Decides which picture to ask for and when.
+//
+// While the view moves: one small picture at a time, as large as comes back quickly. When it rests: all stages.
+// While the model learns: the full picture again from time to time.
+
+import type { Connection } from "./connection";
+import type { PictureHeader, Pinhole, RenderMessage } from "./protocol";
+
+/** What the page looks at now. */
+export interface View {
+  world_from_camera: number[];
+  size_px: [number, number];
+  projection: Pinhole;
+  near_m: number;
+  far_m: number;
+}
+
+const REST_MILLIS = 180;
+const REFRESH_MILLIS = 700;
+/** A refresh takes at most this share of the time. */
+const REFRESH_SHARE = 0.25;
+/** A moving picture that takes longer is asked for smaller, one that takes less than a third of it larger. */
+const MOVING_MILLIS = 110;
+const MOVING_SCALES = [0.1, 0.15, 0.25, 0.35, 0.5];
+/** An answer that does not come within this time is not waited for. */
+const PATIENCE_MILLIS = 3000;
+
+export class RenderAsker {
+  private id = 0;
+  private askedAt = 0;
+  private finishedAt = 0;
+  private lastMillis = 0;
+  private movedAt = -Infinity;
+  private movingIx = 0;
+  private isWaiting = false;
+  private isRested = false;
+  private hasNews = false;
+
+  constructor(
+    private readonly connection: Connection,
+    private readonly view: () => View,
+    private readonly stages: () => number[],
+    private readonly background: [number, number, number],
+  ) {}
+
+  /** The view has changed. */
+  moved(): void {
+    this.movedAt = performance.now();
+    this.isRested = false;
+  }
+
+  /** The model has changed. */
+  learned(): void {
+    this.hasNews = true;
+  }
+
+  /** Nothing asked before will be answered. */
+  restart(): void {
+    this.isWaiting = false;
+    this.isRested = false;
+  }
+
+  /** A picture came; says how long after it was asked for, milliseconds. */
+  answered(header: PictureHeader): number {
+    const millis = performance.now() - this.askedAt;
+    if (header.id !== this.id || !header.last) return millis;
+    this.isWaiting = false;
+    this.finishedAt = performance.now();
+    this.lastMillis = millis;
+    if (header.scale < 1 && header.n_stages === 1) this.adapt(millis);
+    return millis;
+  }
+
+  /** The asked picture will not come. */
+  failed(id: number | null): void {
+    if (id === this.id) this.isWaiting = false;
+  }
+
+  /** Called for every frame on screen. */
+  tick(): void {
+    if (!this.connection.isOpen) return;
+    const now = performance.now();
+    if (this.isWaiting && now - this.askedAt > PATIENCE_MILLIS && !this.isRested) this.isWaiting = false;
+    if (!this.isRested && now - this.movedAt > REST_MILLIS) {
+      this.isRested = true;
+      this.ask(this.stages()); // Replaces whatever is on its way.
+    } else if (!this.isRested && !this.isWaiting) {
+      this.ask([MOVING_SCALES[this.movingIx]!]);
+    } else if (this.isRested && !this.isWaiting && this.hasNews) {
+      const pause = Math.max(REFRESH_MILLIS, this.lastMillis * (1 / REFRESH_SHARE - 1));
+      if (now - this.finishedAt > pause) this.ask([1]);
+    }
+  }
+
+  private ask(stages: number[]): void {
+    this.id += 1;
+    this.askedAt = performance.now();
+    this.isWaiting = true;
+    this.hasNews = false;
+    const message: RenderMessage = {
+      type: "render",
+      id: this.id,
+      ...this.view(),
+      stages,
+      outputs: ["color", "depth"],
+      background_srgb: this.background,
+    };
+    this.connection.send(message);
+  }
+
+  private adapt(millis: number): void {
+    if (millis > MOVING_MILLIS) this.movingIx = Math.max(0, this.movingIx - 1);
+    else if (millis < MOVING_MILLIS / 3) this.movingIx = Math.min(MOVING_SCALES.length - 1, this.movingIx + 1);
+  }
+}
