@@ -68,7 +68,8 @@ struct Readings<T> {
     n_refused: u64,
 }
 
-/// Two neighbours and where between them the stamp lies; the same one twice where it meets a reading.
+/// Two neighbours and where between them the stamp lies: at 0 or 1 it meets a reading, and where that has no neighbour near
+/// enough, it stands twice.
 struct Between<'a, T> {
     before: (Stamp, &'a T),
     after: (Stamp, &'a T),
@@ -109,16 +110,23 @@ impl<T> Readings<T> {
             return Err(HistoryError::TooOld { oldest: *oldest, asked });
         }
         let after_ix = self.kept.partition_point(|(stamp, _)| *stamp < asked);
-        let (after, later) = &self.kept[after_ix];
-        if *after == asked {
-            return Ok(Between { before: (*after, later), after: (*after, later), frac: 0.0 });
+        let reading = |ix: usize| self.kept.get(ix).map(|(stamp, reading)| (*stamp, reading));
+        let near = |a: Stamp, b: Stamp| b.duration_since(a) <= self.max_gap;
+        let after = reading(after_ix).expect("the newest reading is not before the stamp");
+        let before = after_ix.checked_sub(1).and_then(reading);
+        if after.0 == asked {
+            return Ok(match (before, reading(after_ix + 1)) {
+                (Some(before), _) if near(before.0, asked) => Between { before, after, frac: 1.0 },
+                (_, Some(next)) if near(asked, next.0) => Between { before: after, after: next, frac: 0.0 },
+                _ => Between { before: after, after, frac: 0.0 },
+            });
         }
-        let (before, earlier) = &self.kept[after_ix - 1];
-        if after.duration_since(*before) > self.max_gap {
-            return Err(HistoryError::Gap { before: *before, after: *after, max_gap: self.max_gap });
+        let before = before.expect("the oldest reading is not after the stamp");
+        if !near(before.0, after.0) {
+            return Err(HistoryError::Gap { before: before.0, after: after.0, max_gap: self.max_gap });
         }
-        let frac = asked.secs_since(*before) / after.secs_since(*before);
-        Ok(Between { before: (*before, earlier), after: (*after, later), frac })
+        let frac = asked.secs_since(before.0) / after.0.secs_since(before.0);
+        Ok(Between { before, after, frac })
     }
 
     fn newest(&self) -> Option<Stamp> {
@@ -160,15 +168,21 @@ impl JointHistory {
     /// The joints at a stamp.
     ///
     /// Positions follow a cubic through both neighbours' positions and velocities, or a line where velocities are not told;
-    /// velocities are the slope of that curve, efforts lie on a line. A stamp that meets a reading gives that reading.
+    /// velocities are the slope of that curve, efforts lie on a line. A stamp that meets a reading gives that reading, with
+    /// the slope to a neighbour where it tells no velocities.
     pub fn at(&self, stamp: Stamp) -> Result<JointState, HistoryError> {
         let Between { before: (before, a), after: (after, b), frac } = self.readings.around(stamp)?;
-        if before == after {
-            return Ok(a.clone());
-        }
         let span_secs = after.secs_since(before);
         let n_joints = a.position.len();
-        let smooth = a.velocity.len() == n_joints && b.velocity.len() == n_joints;
+        let told = |state: &JointState| state.velocity.len() == n_joints;
+        if frac == 0.0 || frac == 1.0 {
+            let mut met = if frac == 0.0 { a.clone() } else { b.clone() };
+            if !told(&met) && before < after {
+                met.velocity = a.position.iter().zip(&b.position).map(|(from, to)| (to - from) / span_secs).collect();
+            }
+            return Ok(met);
+        }
+        let smooth = told(a) && told(b);
         let curve = |joint: usize| {
             let (from, to) = (a.position[joint], b.position[joint]);
             match smooth {
@@ -234,11 +248,12 @@ impl PoseHistory {
 
     /// The pose at a stamp, by [`transform::interpolate`].
     pub fn at(&self, stamp: Stamp) -> Result<Transform, HistoryError> {
-        let around = self.readings.around(stamp)?;
-        if around.frac == 0.0 {
-            return Ok(*around.before.1);
-        }
-        Ok(transform::interpolate(around.before.1, around.after.1, around.frac))
+        let Between { before: (_, a), after: (_, b), frac } = self.readings.around(stamp)?;
+        Ok(match frac {
+            0.0 => *a,
+            1.0 => *b,
+            _ => transform::interpolate(a, b, frac),
+        })
     }
 
     /// Stamp of the newest pose.
@@ -311,7 +326,13 @@ mod tests {
         assert!((at.position[0] - 0.55).abs() < 1e-12 && (at.position[1] + 1.1).abs() < 1e-12);
         assert!((at.velocity[0] - 10.0).abs() < 1e-9);
         assert!((at.effort[0] - 5.5).abs() < 1e-12);
-        assert_eq!(history.at(Stamp::from_secs(1.02)).unwrap(), state(1.02, 0.7, None));
+        for (secs, position) in [(1.0, 0.5), (1.02, 0.7)] {
+            let met = history.at(Stamp::from_secs(secs)).unwrap();
+            assert!((met.velocity[0] - 10.0).abs() < 1e-9);
+            assert_eq!(JointState { velocity: vec![], ..met }, state(secs, position, None));
+        }
+        let alone = self::history([state(1.0, 0.5, None)]);
+        assert_eq!(alone.at(Stamp::from_secs(1.0)).unwrap(), state(1.0, 0.5, None));
     }
 
     #[test]

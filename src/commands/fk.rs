@@ -18,11 +18,11 @@ pub(crate) struct Args {
     /// Link the poses are told in [default: the link above all others]
     #[arg(long, value_name = "LINK")]
     base: Option<String>,
-    /// Joint values: {"joint_names": ["j1", ...], "configurations": [[0.1, ...], ...]}
+    /// Joint values as JSON, `{"joint_names": ["j1", ...], "configurations": [[0.1, ...], ...]}`
     ///
     /// Radians for turning joints, metres for sliding ones. Names may come in any order. Joints of the robot that do not
     /// move the tip may be there and change nothing, and so may joints that mimic others: they follow those.
-    #[arg(long, value_name = "FILE.json", verbatim_doc_comment)]
+    #[arg(long, value_name = "FILE.json")]
     joints: PathBuf,
 }
 
