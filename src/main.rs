@@ -1,3 +1,35 @@
-//! The `fieldrig` command.
+//! The `fieldrig` command: parse, run, exit code.
 
-fn main() {}
+mod cli;
+mod commands;
+mod exit;
+mod print;
+
+use clap::Parser;
+use std::io::Write;
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    keep_wayland_quiet();
+    let cli = cli::Cli::parse();
+    print::start_log(cli.verbose);
+    match commands::run(cli.command) {
+        Ok(exit) => exit.into(),
+        Err(error) if exit::is_broken_pipe(&error) => exit::Exit::Done.into(),
+        Err(error) => {
+            // When stderr is gone too, the exit code still tells.
+            let _ = writeln!(std::io::stderr(), "error: {error:#}");
+            exit::of(&error).into()
+        }
+    }
+}
+
+/// Without a desktop, software Vulkan looks for a Wayland display all the same, and its library prints an error that is
+/// none; it does not when the display it is to look for has a full path.
+#[expect(unsafe_code, reason = "the environment is the only way to tell that library")]
+fn keep_wayland_quiet() {
+    if std::env::var_os("XDG_RUNTIME_DIR").is_none() && std::env::var_os("WAYLAND_DISPLAY").is_none() {
+        // SAFETY: this is the first thing the program does; no other thread exists that could read the environment.
+        unsafe { std::env::set_var("WAYLAND_DISPLAY", "/nowhere") };
+    }
+}

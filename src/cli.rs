@@ -1,0 +1,33 @@
+//! The commands and what `--help` says of them; each command's flags stand at the head of its own file.
+
+use crate::commands::{devices, doctor, fk};
+use clap::{ArgAction, Parser, Subcommand};
+
+/// Turns a robot's cameras and joints into a live radiance field.
+#[derive(Debug, Parser)]
+#[command(
+    name = "fieldrig",
+    version,
+    arg_required_else_help = true,
+    max_term_width = 110,
+    after_help = "Results go to stdout, log and progress to stderr.\n\
+                  Exit codes: 0 done, 1 failed, 2 bad arguments, 3 done with loss, 4 refused for lack of evidence."
+)]
+pub(crate) struct Cli {
+    /// Say more on stderr; twice for everything
+    #[arg(short, long, global = true, action = ArgAction::Count)]
+    pub(crate) verbose: u8,
+    #[command(subcommand)]
+    pub(crate) command: Command,
+}
+
+/// What to do.
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Compute where a robot's tip is for given joint values
+    Fk(fk::Args),
+    /// List what is plugged in and what of it can be used
+    Devices(devices::Args),
+    /// Check GPU, clocks, memory and permissions, and name the line that mends what is amiss
+    Doctor(doctor::Args),
+}

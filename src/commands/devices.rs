@@ -1,0 +1,178 @@
+//! `fieldrig devices`: what is plugged in, as far as the kernel tells, and what of it a rig file can name.
+
+use crate::exit::Exit;
+use crate::print;
+use serde::Serialize;
+use std::path::Path;
+
+/// `ARPHRD_CAN` of Linux's `if_arp.h`: the kind of a CAN interface in sysfs.
+const CAN_INTERFACE_KIND: &str = "280";
+/// Intel's USB vendor number; RealSense cameras carry it.
+const INTEL_USB_VENDOR: &str = "8086";
+
+/// Flags of `devices`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Print one JSON object a line
+    #[arg(long)]
+    json: bool,
+}
+
+/// One thing found.
+#[derive(Debug, PartialEq, Eq, Serialize)]
+struct Found {
+    /// `gpu`, `camera`, `can` or `simulation`.
+    kind: &'static str,
+    /// What to write into a rig file or to show.
+    address: String,
+    /// What it calls itself.
+    name: String,
+    /// Whether this build can use it.
+    usable: bool,
+    /// Why not, or how.
+    note: String,
+}
+
+/// Lists the devices.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let mut found = vec![gpu(), simulation()];
+    let sys = Path::new("/sys");
+    found.extend(video_devices(sys));
+    found.extend(realsense_cameras(sys));
+    found.extend(can_interfaces(sys));
+    for device in &found {
+        if args.json {
+            print::json(device)?;
+        } else {
+            let mark = if device.usable { "yes" } else { "no " };
+            print::line(format_args!("{mark}  {:10} {:14} {}", device.kind, device.address, device.name))?;
+            print::line(format_args!("     {}", device.note))?;
+        }
+    }
+    if !args.json {
+        print::line("Arms on the network (Franka's FCI) cannot be probed yet: nothing is sent to them from here.")?;
+    }
+    Ok(Exit::Done)
+}
+
+fn gpu() -> Found {
+    let (name, usable, note) = match super::open_gpu() {
+        Ok(gpu) if gpu.is_software() => (gpu.describe(), true, "in software: works, slowly".to_owned()),
+        Ok(gpu) => (gpu.describe(), true, "trains and renders".to_owned()),
+        Err(error) => ("none".to_owned(), false, error.to_string()),
+    };
+    Found { kind: "gpu", address: "default".into(), name, usable, note }
+}
+
+fn simulation() -> Found {
+    let usable = cfg!(feature = "sim");
+    let note = if usable {
+        "`--sim` puts simulated twins in the place of a rig's devices"
+    } else {
+        "built without simulation: `make deps`, then `cargo build --release --features sim`"
+    };
+    Found { kind: "simulation", address: "--sim".into(), name: "MuJoCo".into(), usable, note: note.into() }
+}
+
+/// V4L2 devices: cameras, capture cards and their metadata nodes.
+fn video_devices(sys: &Path) -> Vec<Found> {
+    let describe = |node: String, name: String| Found {
+        kind: "camera",
+        address: format!("/dev/{node}"),
+        name,
+        usable: false,
+        note: "V4L2 cameras have no driver in this version".into(),
+    };
+    children(&sys.join("class/video4linux"))
+        .into_iter()
+        .map(|node| {
+            let name = attribute(&sys.join("class/video4linux").join(&node).join("name")).unwrap_or_default();
+            describe(node, name)
+        })
+        .collect()
+}
+
+/// RealSense cameras on USB.
+fn realsense_cameras(sys: &Path) -> Vec<Found> {
+    let usb = sys.join("bus/usb/devices");
+    children(&usb)
+        .into_iter()
+        .filter(|device| attribute(&usb.join(device).join("idVendor")).as_deref() == Some(INTEL_USB_VENDOR))
+        .filter_map(|device| {
+            let name = attribute(&usb.join(&device).join("product")).filter(|name| name.contains("RealSense"))?;
+            let note = "RealSense cameras have no driver in this version".into();
+            Some(Found { kind: "camera", address: format!("usb {device}"), name, usable: false, note })
+        })
+        .collect()
+}
+
+/// CAN interfaces, real and virtual.
+fn can_interfaces(sys: &Path) -> Vec<Found> {
+    let net = sys.join("class/net");
+    children(&net)
+        .into_iter()
+        .filter(|interface| attribute(&net.join(interface).join("type")).as_deref() == Some(CAN_INTERFACE_KIND))
+        .map(|interface| {
+            let state = attribute(&net.join(&interface).join("operstate")).unwrap_or_else(|| "unknown".into());
+            let note = "motor arms on CAN have no driver in this version".into();
+            Found { kind: "can", address: interface, name: format!("CAN interface, {state}"), usable: false, note }
+        })
+        .collect()
+}
+
+/// Names in a folder of sysfs, sorted; none where it is absent.
+fn children(folder: &Path) -> Vec<String> {
+    let mut names: Vec<String> = std::fs::read_dir(folder)
+        .into_iter()
+        .flatten()
+        .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
+        .collect();
+    names.sort_unstable();
+    names
+}
+
+/// A sysfs attribute, trimmed.
+fn attribute(path: &Path) -> Option<String> {
+    Some(std::fs::read_to_string(path).ok()?.trim().to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn write(root: &Path, path: &str, text: &str) {
+        let path = root.join(path);
+        std::fs::create_dir_all(path.parent().expect("inside root")).expect("folder");
+        std::fs::write(path, text).expect("file");
+    }
+
+    #[test]
+    fn sysfs_is_read_by_kind() {
+        let sys = tempfile::tempdir().expect("folder");
+        write(sys.path(), "class/video4linux/video2/name", "Integrated Camera\n");
+        write(sys.path(), "class/net/can0/type", "280\n");
+        write(sys.path(), "class/net/can0/operstate", "up\n");
+        write(sys.path(), "class/net/eth0/type", "1\n");
+        write(sys.path(), "bus/usb/devices/2-1/idVendor", "8086\n");
+        write(sys.path(), "bus/usb/devices/2-1/product", "Intel(R) RealSense(TM) Depth Camera 435i\n");
+        write(sys.path(), "bus/usb/devices/2-2/idVendor", "8086\n");
+        write(sys.path(), "bus/usb/devices/2-2/product", "Bluetooth\n");
+        let video = video_devices(sys.path());
+        assert_eq!(video.len(), 1);
+        assert_eq!((video[0].address.as_str(), video[0].name.as_str()), ("/dev/video2", "Integrated Camera"));
+        let can = can_interfaces(sys.path());
+        assert_eq!(can.len(), 1);
+        assert_eq!((can[0].address.as_str(), can[0].name.as_str()), ("can0", "CAN interface, up"));
+        let realsense = realsense_cameras(sys.path());
+        assert_eq!(realsense.len(), 1);
+        assert_eq!(realsense[0].address, "usb 2-1");
+    }
+
+    #[test]
+    fn an_absent_sysfs_has_no_devices() {
+        let sys = tempfile::tempdir().expect("folder");
+        assert_eq!(video_devices(sys.path()), []);
+        assert_eq!(realsense_cameras(sys.path()), []);
+        assert_eq!(can_interfaces(sys.path()), []);
+    }
+}

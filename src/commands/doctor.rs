@@ -1,0 +1,280 @@
+//! `fieldrig doctor`: what this machine lacks for a rig, each with the line that mends it.
+
+use crate::exit::Exit;
+use crate::print;
+use serde::Serialize;
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// A model of a million splats with its keyframes and the optimiser's state fits into this.
+const ENOUGH_MEMORY_KIB: u64 = 4 << 20;
+/// Where `run` serves unless told otherwise.
+const USUAL_ADDRESS: &str = "127.0.0.1:7007";
+/// Stamps are compared with the time an image row takes, tens of microseconds.
+const FINE_CLOCK: Duration = Duration::from_micros(1);
+
+/// Flags of `doctor`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Print one JSON object a line
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+enum Verdict {
+    Ok,
+    Warn,
+    Fail,
+}
+
+/// One thing looked at.
+#[derive(Debug, PartialEq, Eq, Serialize)]
+struct Finding {
+    what: &'static str,
+    verdict: Verdict,
+    says: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    mend: Option<String>,
+}
+
+impl Finding {
+    fn ok(what: &'static str, says: impl Into<String>) -> Self {
+        Self { what, verdict: Verdict::Ok, says: says.into(), mend: None }
+    }
+
+    fn warn(what: &'static str, says: impl Into<String>, mend: impl Into<String>) -> Self {
+        Self { what, verdict: Verdict::Warn, says: says.into(), mend: Some(mend.into()) }
+    }
+
+    fn fail(what: &'static str, says: impl Into<String>, mend: impl Into<String>) -> Self {
+        Self { what, verdict: Verdict::Fail, says: says.into(), mend: Some(mend.into()) }
+    }
+}
+
+/// Checks everything; fails when a finding does.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let mut findings = gpu();
+    findings.push(simulation());
+    findings.push(clock());
+    findings.push(clock_source(Path::new("/sys")));
+    findings.extend(governor(Path::new("/sys")));
+    findings.push(memory(Path::new("/proc")));
+    findings.push(realtime(Path::new("/proc")));
+    findings.push(cameras(Path::new("/dev")));
+    findings.push(port(USUAL_ADDRESS));
+    for finding in &findings {
+        if args.json {
+            print::json(finding)?;
+            continue;
+        }
+        let mark = match finding.verdict {
+            Verdict::Ok => "ok  ",
+            Verdict::Warn => "warn",
+            Verdict::Fail => "fail",
+        };
+        print::line(format_args!("{mark}  {:12} {}", finding.what, finding.says))?;
+        if let Some(mend) = &finding.mend {
+            print::line(format_args!("      {:12} -> {mend}", ""))?;
+        }
+    }
+    let failed = findings.iter().any(|finding| finding.verdict == Verdict::Fail);
+    Ok(if failed { Exit::Failed } else { Exit::Done })
+}
+
+fn gpu() -> Vec<Finding> {
+    let gpu = match super::open_gpu() {
+        Ok(gpu) => gpu,
+        Err(error) => {
+            let mend =
+                "sudo apt-get install -y libvulkan1 mesa-vulkan-drivers   (in software; a GPU needs its own driver)";
+            return vec![Finding::fail("gpu", error.to_string(), mend)];
+        }
+    };
+    let adapter = if gpu.is_software() {
+        let mend = "install the Vulkan driver of the GPU, if there is one: training is slow in software";
+        Finding::warn("gpu", gpu.describe(), mend)
+    } else {
+        Finding::ok("gpu", gpu.describe())
+    };
+    let optional = gpu.optional();
+    let lanes = optional.subgroup_lanes.map_or("none".to_owned(), |lanes| lanes.to_string());
+    let timestamps = if optional.timestamps { "yes" } else { "no: times per pass are not known" };
+    let mib = gpu.max_binding_bytes() >> 20;
+    let says = format!("largest buffer {mib} MiB, subgroup lanes {lanes}, timestamps {timestamps}");
+    vec![adapter, Finding::ok("gpu limits", says)]
+}
+
+fn simulation() -> Finding {
+    if cfg!(feature = "sim") {
+        Finding::ok("simulation", "MuJoCo is built in")
+    } else {
+        let mend = "make deps && cargo build --release --features sim";
+        Finding::warn("simulation", "built without MuJoCo: `--sim` is not there", mend)
+    }
+}
+
+/// The smallest step the monotonic clock shows.
+fn clock() -> Finding {
+    let mut finest = Duration::MAX;
+    for _ in 0..1000 {
+        let start = Instant::now();
+        let step = loop {
+            let step = start.elapsed();
+            if !step.is_zero() {
+                break step;
+            }
+        };
+        finest = finest.min(step);
+    }
+    let says = format!("monotonic clock, steps of {finest:?}");
+    if finest <= FINE_CLOCK {
+        Finding::ok("clock", says)
+    } else {
+        Finding::warn("clock", says, "stamps are this coarse: look for another clock source below")
+    }
+}
+
+fn clock_source(sys: &Path) -> Finding {
+    let folder = sys.join("devices/system/clocksource/clocksource0");
+    let Ok(current) = std::fs::read_to_string(folder.join("current_clocksource")) else {
+        return Finding::ok("clock source", "the kernel does not tell");
+    };
+    let current = current.trim();
+    if matches!(current, "hpet" | "acpi_pm" | "pit" | "jiffies") {
+        let mend = format!("echo tsc | sudo tee {}", folder.join("current_clocksource").display());
+        return Finding::warn("clock source", format!("{current}: slow to read"), mend);
+    }
+    Finding::ok("clock source", current)
+}
+
+/// The frequency governor, where the machine has one.
+fn governor(sys: &Path) -> Option<Finding> {
+    let governor = std::fs::read_to_string(sys.join("devices/system/cpu/cpu0/cpufreq/scaling_governor")).ok()?;
+    let governor = governor.trim();
+    Some(match governor {
+        "performance" => Finding::ok("governor", governor),
+        _ => {
+            Finding::warn("governor", format!("{governor}: delays vary"), "sudo cpupower frequency-set -g performance")
+        }
+    })
+}
+
+fn memory(proc: &Path) -> Finding {
+    let Some(available_kib) = field(&proc.join("meminfo"), "MemAvailable:").and_then(|kib| kib.parse::<u64>().ok())
+    else {
+        return Finding::ok("memory", "the kernel does not tell");
+    };
+    let says = format!("{} MiB available", available_kib >> 10);
+    if available_kib >= ENOUGH_MEMORY_KIB {
+        Finding::ok("memory", says)
+    } else {
+        Finding::warn("memory", says, "close other programs, or lower max_keyframes and max_splats in the rig file")
+    }
+}
+
+/// The real-time priority this user may ask for, which arms at 1 kHz need.
+fn realtime(proc: &Path) -> Finding {
+    let limit = field(&proc.join("self/limits"), "Max realtime priority");
+    match limit.as_deref() {
+        None => Finding::ok("real time", "the kernel does not tell"),
+        Some("0") => {
+            let says = "real-time priority is not allowed; only arms controlled at 1 kHz need it";
+            let mend = r#"echo "$USER - rtprio 99" | sudo tee -a /etc/security/limits.conf, then log in again"#;
+            Finding::warn("real time", says, mend)
+        }
+        Some(limit) => Finding::ok("real time", format!("priority up to {limit}")),
+    }
+}
+
+/// The first word after `key` at the start of a line.
+fn field(file: &Path, key: &str) -> Option<String> {
+    let text = std::fs::read_to_string(file).ok()?;
+    let rest = text.lines().find_map(|line| line.strip_prefix(key))?;
+    rest.split_whitespace().next().map(str::to_owned)
+}
+
+/// Whether the video devices may be opened.
+fn cameras(dev: &Path) -> Finding {
+    let mut nodes: Vec<PathBuf> = std::fs::read_dir(dev)
+        .into_iter()
+        .flatten()
+        .filter_map(|entry| Some(entry.ok()?.path()))
+        .filter(|path| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with("video")))
+        .collect();
+    nodes.sort_unstable();
+    let denied: Vec<String> = nodes
+        .iter()
+        .filter(|node| {
+            let opened = std::fs::File::options().read(true).write(true).open(node);
+            opened.is_err_and(|error| error.kind() == std::io::ErrorKind::PermissionDenied)
+        })
+        .map(|node| node.display().to_string())
+        .collect();
+    if denied.is_empty() {
+        return Finding::ok("cameras", format!("{} video devices, none refused", nodes.len()));
+    }
+    let says = format!("no permission to open {}", denied.join(", "));
+    Finding::warn("cameras", says, "sudo usermod -aG video $USER, then log in again")
+}
+
+fn port(address: &str) -> Finding {
+    match TcpListener::bind(address) {
+        Ok(_) => Finding::ok("network", format!("{address} is free for the page")),
+        Err(error) => {
+            let mend = "name another address: fieldrig run ... --listen 127.0.0.1:7008";
+            Finding::warn("network", format!("{address}: {error}"), mend)
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn folder_with(path: &str, text: &str) -> tempfile::TempDir {
+        let root = tempfile::tempdir().expect("folder");
+        let file = root.path().join(path);
+        std::fs::create_dir_all(file.parent().expect("inside root")).expect("folder");
+        std::fs::write(file, text).expect("file");
+        root
+    }
+
+    #[test]
+    fn little_memory_is_told() {
+        let little = folder_with("meminfo", "MemTotal:  8000000 kB\nMemAvailable:  1048576 kB\n");
+        assert_eq!(memory(little.path()).verdict, Verdict::Warn);
+        assert!(memory(little.path()).says.contains("1024 MiB"));
+        let much = folder_with("meminfo", "MemTotal:  8000000 kB\nMemAvailable:  7000000 kB\n");
+        assert_eq!(memory(much.path()).verdict, Verdict::Ok);
+    }
+
+    #[test]
+    fn missing_real_time_priority_is_told_with_its_remedy() {
+        let denied =
+            folder_with("self/limits", "Max nice priority         0          0\nMax realtime priority     0       0\n");
+        let finding = realtime(denied.path());
+        assert_eq!(finding.verdict, Verdict::Warn);
+        assert!(finding.mend.expect("a remedy").contains("rtprio"));
+        let allowed = folder_with("self/limits", "Max realtime priority     99      99\n");
+        assert_eq!(realtime(allowed.path()).verdict, Verdict::Ok);
+    }
+
+    #[test]
+    fn a_slow_clock_source_is_told() {
+        let path = "devices/system/clocksource/clocksource0/current_clocksource";
+        assert_eq!(clock_source(folder_with(path, "hpet\n").path()).verdict, Verdict::Warn);
+        assert_eq!(clock_source(folder_with(path, "tsc\n").path()).verdict, Verdict::Ok);
+    }
+
+    #[test]
+    fn a_taken_port_is_told() {
+        let taken = TcpListener::bind("127.0.0.1:0").expect("a free port");
+        let address = taken.local_addr().expect("bound").to_string();
+        assert_eq!(port(&address).verdict, Verdict::Warn);
+        drop(taken);
+        assert_eq!(port(&address).verdict, Verdict::Ok);
+    }
+}

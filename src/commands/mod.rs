@@ -1,0 +1,25 @@
+//! One file a subcommand.
+
+pub(crate) mod devices;
+pub(crate) mod doctor;
+pub(crate) mod fk;
+
+use crate::cli::Command;
+use crate::exit::Exit;
+use std::sync::Arc;
+use trainer::gpu::{Gpu, GpuOptions};
+
+/// Runs a command.
+pub(crate) fn run(command: Command) -> anyhow::Result<Exit> {
+    match command {
+        Command::Fk(args) => fk::run(args).map(|()| Exit::Done),
+        Command::Devices(args) => devices::run(&args),
+        Command::Doctor(args) => doctor::run(&args),
+    }
+}
+
+/// Opens the GPU; `FIELDRIG_GPU_FEATURES=none` does without everything optional.
+fn open_gpu() -> Result<Arc<Gpu>, trainer::Error> {
+    let optional_features = std::env::var_os("FIELDRIG_GPU_FEATURES").is_none_or(|value| value != "none");
+    Gpu::open(&GpuOptions { optional_features, ..GpuOptions::default() })
+}

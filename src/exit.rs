@@ -1,0 +1,60 @@
+//! Exit codes, and which error means which.
+
+use std::io::ErrorKind;
+use std::process::ExitCode;
+
+/// How a command ended; the number is the exit code.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub(crate) enum Exit {
+    /// All done.
+    Done = 0,
+    /// Something failed.
+    Failed = 1,
+    /// The arguments, or the rig file they name, make no sense.
+    BadArguments = 2,
+}
+
+impl From<Exit> for ExitCode {
+    fn from(exit: Exit) -> Self {
+        Self::from(exit as u8)
+    }
+}
+
+/// An error that is the caller's: wrong arguments, or a rig file that does not check.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub(crate) struct BadArgument(pub(crate) String);
+
+/// The exit code of an error.
+pub(crate) fn of(error: &anyhow::Error) -> Exit {
+    if error.chain().any(|cause| cause.is::<BadArgument>()) { Exit::BadArguments } else { Exit::Failed }
+}
+
+/// Whether whoever read our output went away, as `head` does.
+pub(crate) fn is_broken_pipe(error: &anyhow::Error) -> bool {
+    let is_pipe = |io: &std::io::Error| io.kind() == ErrorKind::BrokenPipe;
+    error.downcast_ref::<crate::print::StdoutError>().is_some_and(|error| is_pipe(&error.0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use anyhow::Context;
+
+    #[test]
+    fn bad_arguments_stay_so_under_context() {
+        let error = anyhow::Error::new(BadArgument("unknown key".into())).context("rig file");
+        assert_eq!(of(&error), Exit::BadArguments);
+        assert_eq!(of(&anyhow::anyhow!("disk full")), Exit::Failed);
+    }
+
+    #[test]
+    fn only_a_closed_stdout_is_no_error() {
+        let closed = || std::io::Error::from(ErrorKind::BrokenPipe);
+        assert!(is_broken_pipe(&crate::print::StdoutError(closed()).into()));
+        assert!(!is_broken_pipe(&crate::print::StdoutError(ErrorKind::StorageFull.into()).into()));
+        let camera = Err::<(), _>(closed()).context("camera").expect_err("closed");
+        assert!(!is_broken_pipe(&camera));
+    }
+}

@@ -1,0 +1,79 @@
+//! Which crate of the workspace may depend on which: the arrows of ARCHITECTURE.md, read from `cargo metadata`.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::process::Command;
+
+/// Every crate and all that it may depend on inside the workspace.
+const ALLOWED: [(&str, &[&str]); 6] = [
+    ("kinematics", &[]),
+    ("drivers", &["kinematics"]),
+    ("sim", &["drivers", "kinematics"]),
+    ("trainer", &["kinematics"]),
+    ("viz", &["kinematics", "trainer"]),
+    ("fieldrig", &["drivers", "kinematics", "sim", "trainer", "viz"]),
+];
+
+/// Crates that only `fieldrig` itself may use: printing and command lines are its business.
+const ONLY_AT_THE_TOP: [&str; 5] = ["anyhow", "clap", "ctrlc", "env_logger", "indicatif"];
+
+/// Direct dependencies by package, dev-dependencies left out.
+type Dependencies = BTreeMap<String, BTreeSet<String>>;
+
+fn dependencies() -> Dependencies {
+    let output = Command::new(env!("CARGO"))
+        .args(["metadata", "--format-version", "1", "--no-deps", "--offline"])
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .output()
+        .expect("cargo runs");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let metadata: serde_json::Value = serde_json::from_slice(&output.stdout).expect("cargo prints JSON");
+    let text = |value: &serde_json::Value| value.as_str().expect("a string").to_owned();
+    metadata["packages"]
+        .as_array()
+        .expect("packages")
+        .iter()
+        .map(|package| {
+            let direct = package["dependencies"].as_array().expect("dependencies").iter();
+            let shipped = direct.filter(|dependency| dependency["kind"] != "dev");
+            (text(&package["name"]), shipped.map(|dependency| text(&dependency["name"])).collect())
+        })
+        .collect()
+}
+
+/// Every arrow that should not be there, and every crate that has no rule.
+fn wrong_arrows(dependencies: &Dependencies) -> Vec<String> {
+    let mut wrong = Vec::new();
+    let ours: BTreeSet<&str> = dependencies.keys().map(String::as_str).collect();
+    for (package, direct) in dependencies {
+        let Some((_, allowed)) = ALLOWED.iter().find(|(name, _)| name == package) else {
+            wrong.push(format!("{package} has no rule in this test"));
+            continue;
+        };
+        for dependency in direct {
+            if ours.contains(dependency.as_str()) && !allowed.contains(&dependency.as_str()) {
+                wrong.push(format!("{package} -> {dependency}"));
+            }
+            if package != "fieldrig" && ONLY_AT_THE_TOP.contains(&dependency.as_str()) {
+                wrong.push(format!("{package} -> {dependency}, which only fieldrig may use"));
+            }
+        }
+    }
+    wrong
+}
+
+#[test]
+fn dependencies_follow_the_arrows() {
+    let dependencies = dependencies();
+    assert_eq!(dependencies.len(), ALLOWED.len(), "crates: {:?}", dependencies.keys());
+    assert_eq!(wrong_arrows(&dependencies), Vec::<String>::new());
+}
+
+#[test]
+fn a_wrong_arrow_is_seen() {
+    let mut dependencies = dependencies();
+    dependencies.get_mut("trainer").expect("trainer").extend(["drivers".to_owned(), "anyhow".to_owned()]);
+    dependencies.insert("shortcut".to_owned(), BTreeSet::new());
+    let expected =
+        ["shortcut has no rule in this test", "trainer -> anyhow, which only fieldrig may use", "trainer -> drivers"];
+    assert_eq!(wrong_arrows(&dependencies), expected);
+}

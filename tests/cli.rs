@@ -1,0 +1,122 @@
+//! The command line as a stranger meets it: help, exit codes, one clear sentence for wrong input.
+
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+
+/// Commands that `fieldrig --help` must list, each with help of its own.
+const COMMANDS: [&str; 3] = ["fk", "devices", "doctor"];
+
+fn fieldrig(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_fieldrig")).args(args).output().expect("fieldrig starts")
+}
+
+fn stdout(output: &Output) -> String {
+    String::from_utf8(output.stdout.clone()).expect("stdout is UTF-8")
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8(output.stderr.clone()).expect("stderr is UTF-8")
+}
+
+/// Asserts the exit code and one sentence on stderr that holds every word of `words`.
+fn assert_refused(args: &[&str], code: i32, words: &[&str]) {
+    let output = fieldrig(args);
+    let told = stderr(&output);
+    assert_eq!(output.status.code(), Some(code), "{args:?}: {told}");
+    assert!(!told.contains("panicked"), "{args:?}: {told}");
+    for word in words {
+        assert!(told.contains(word), "{args:?} does not speak of {word:?}: {told}");
+    }
+    let sentences: Vec<&str> = told.lines().filter(|line| line.starts_with("error: ")).collect();
+    assert_eq!(sentences.len(), 1, "{args:?}: {told}");
+}
+
+#[test]
+fn help_lists_every_command_and_each_has_its_own() {
+    let all = fieldrig(&["--help"]);
+    assert_eq!(all.status.code(), Some(0));
+    for command in COMMANDS {
+        assert!(stdout(&all).contains(&format!("\n  {command} ")), "{command} is not listed:\n{}", stdout(&all));
+        let one = fieldrig(&[command, "--help"]);
+        assert_eq!(one.status.code(), Some(0), "{command} --help");
+        assert!(stdout(&one).contains("Usage: fieldrig"), "{}", stdout(&one));
+    }
+    let listed = stdout(&all)
+        .lines()
+        .skip_while(|line| *line != "Commands:")
+        .skip(1)
+        .take_while(|line| !line.is_empty())
+        .count();
+    assert_eq!(listed, COMMANDS.len() + 1, "a command is missing in this test:\n{}", stdout(&all));
+}
+
+#[test]
+fn wrong_arguments_exit_with_2() {
+    assert_eq!(fieldrig(&[]).status.code(), Some(2));
+    assert_refused(&["walk"], 2, &["walk"]);
+    assert_refused(&["doctor", "--colour"], 2, &["--colour"]);
+}
+
+#[test]
+fn a_file_that_is_not_there_exits_with_1_and_is_named() {
+    assert_refused(
+        &["fk", "absent.urdf", "--tip", "tool", "--joints", "absent.json"],
+        1,
+        &["absent.urdf", "No such file"],
+    );
+}
+
+#[test]
+fn devices_are_told_as_json() {
+    let output = fieldrig(&["devices", "--json"]);
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    let kinds: Vec<String> = stdout(&output)
+        .lines()
+        .map(|line| serde_json::from_str::<serde_json::Value>(line).expect("a JSON object a line"))
+        .map(|device| device["kind"].as_str().expect("a kind").to_owned())
+        .collect();
+    assert!(kinds.contains(&"gpu".to_owned()) && kinds.contains(&"simulation".to_owned()), "{kinds:?}");
+}
+
+#[test]
+fn the_doctor_fails_exactly_when_a_finding_does() {
+    let output = fieldrig(&["doctor", "--json"]);
+    let findings: Vec<serde_json::Value> =
+        stdout(&output).lines().map(|line| serde_json::from_str(line).expect("a JSON object a line")).collect();
+    assert!(findings.len() >= 7, "{findings:?}");
+    let failed = findings.iter().any(|finding| finding["verdict"] == "fail");
+    assert_eq!(output.status.code(), Some(i32::from(failed)));
+    for finding in &findings {
+        assert_eq!(
+            finding["verdict"] != "ok",
+            finding["mend"].is_string(),
+            "a remedy for all that is amiss: {finding}"
+        );
+    }
+}
+
+#[test]
+fn without_a_vulkan_driver_the_doctor_names_the_package() {
+    let absent = Path::new(env!("CARGO_MANIFEST_DIR")).join("no-such-driver.json");
+    let output = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
+        .arg("doctor")
+        .env("VK_DRIVER_FILES", &absent)
+        .env("VK_ICD_FILENAMES", &absent)
+        .output()
+        .expect("fieldrig starts");
+    assert_eq!(output.status.code(), Some(1), "{}", stdout(&output));
+    assert!(stdout(&output).contains("mesa-vulkan-drivers"), "{}", stdout(&output));
+}
+
+#[test]
+fn a_reader_that_goes_away_is_no_error() {
+    let mut child = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
+        .args(["devices", "--json"])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("fieldrig starts");
+    drop(child.stdout.take());
+    let output = child.wait_with_output().expect("fieldrig ends");
+    assert_eq!((output.status.code(), stderr(&output)), (Some(0), String::new()));
+}
