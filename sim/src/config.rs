@@ -2,7 +2,7 @@
 
 use crate::Error;
 use kinematics::{Intrinsics, Lens, Transform};
-use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+use nalgebra::{Translation3, UnitQuaternion, Vector3};
 
 /// A simulated rig.
 #[derive(Clone, Debug, PartialEq)]
@@ -139,7 +139,7 @@ impl Default for DepthConfig {
 }
 
 impl CameraConfig {
-    /// A wrist RGB-D camera like a `RealSense` D435i, 640x480 at 15 Hz, in front of the flange and looking along its z axis.
+    /// A wrist RGB-D camera like a `RealSense` D435i, 640x480 at 15 Hz, tilted on a bracket beside the flange.
     pub fn wrist(name: &str) -> Self {
         Self {
             name: name.to_owned(),
@@ -159,13 +159,13 @@ impl CameraConfig {
     }
 }
 
-/// The bracket of the wrist camera, as `flange_from_camera`.
+/// The bracket of the wrist camera, as `flange_from_camera`: beside the flange, tilted by 50 degrees to look past it.
+///
+/// The tilt lets the arm look at the scene from low elevations without reaching its joint limits.
 fn wrist_mount() -> Transform {
-    let half = std::f64::consts::FRAC_1_SQRT_2;
-    Transform::from_parts(
-        Translation3::new(0.041, 0.0, 0.063),
-        UnitQuaternion::from_quaternion(Quaternion::new(half, 0.0, 0.0, half)),
-    )
+    let quarter = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2);
+    let tilt = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), 50f64.to_radians());
+    Transform::from_parts(Translation3::new(0.06, 0.0, 0.045), quarter * tilt)
 }
 
 impl Default for Config {
@@ -221,7 +221,8 @@ impl CameraConfig {
             check(&self.name, "principal_px", principal_px[axis], 0.0, size)?;
         }
         check(&self.name, "rate_hz", self.rate_hz, 0.01, 200.0)?;
-        let pose = self.parent_from_camera.translation.vector.iter().chain(self.parent_from_camera.rotation.coords.iter());
+        let pose =
+            self.parent_from_camera.translation.vector.iter().chain(self.parent_from_camera.rotation.coords.iter());
         for number in pose {
             check(&self.name, "parent_from_camera", *number, -100.0, 100.0)?;
         }

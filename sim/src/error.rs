@@ -49,6 +49,20 @@ pub enum Error {
         /// Why.
         source: image::ImageError,
     },
+    /// The lens shows nothing at a pixel.
+    #[error("camera {camera:?}: the lens shows nothing at pixel {pixel:?}")]
+    Lens {
+        /// Name of the camera.
+        camera: String,
+        /// The pixel.
+        pixel: [f64; 2],
+    },
+    /// The arm's past does not reach back far enough.
+    #[error("no joint reading around {nanos} ns of simulated time")]
+    NoHistory {
+        /// Simulated time.
+        nanos: i64,
+    },
     /// The EGL library is missing.
     #[error("cannot load libEGL.so.1 (Debian: libegl1 libegl-mesa0 libgl1-mesa-dri): {reason}")]
     NoEgl {

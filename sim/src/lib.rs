@@ -1,7 +1,30 @@
 //! Simulated rigs in MuJoCo, behind the traits of `drivers`.
+//!
+//! [`open`] builds a rig; [`Rig::into_lockstep`] plays it as fast as the caller takes samples, the same bits for the same
+//! seed; [`Rig::into_live`] plays it in real time as devices.
 
+mod arm;
 pub mod config;
+mod egl;
+mod engine;
 mod error;
+mod live;
+mod lockstep;
+mod mesh;
+mod noise;
+mod optics;
+mod panda;
+mod random;
+mod render;
+mod rig;
+mod scan;
+mod scene;
+pub mod tag;
+mod texture;
+mod toy;
 
 pub use config::{CameraConfig, Config, DepthConfig, Parent, Scene, SensorConfig};
 pub use error::Error;
+pub use live::LiveRig;
+pub use lockstep::Lockstep;
+pub use rig::{CameraInfo, PANDA_URDF, Rig, RigInfo, open};

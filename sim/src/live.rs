@@ -1,0 +1,251 @@
+//! A rig in real time: devices behind the traits of `drivers`, fed by one thread.
+
+use crate::Error;
+use crate::engine::{Delivery, Engine};
+use crate::rig::RigInfo;
+use drivers::{Arm, Camera, Image, PixelFormat, Sample, TruthImage};
+use kinematics::{Intrinsics, JointState, Stamp};
+use std::collections::VecDeque;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+/// Images of one camera that wait for a slow caller.
+const MAX_IMAGES: usize = 8;
+/// Joint readings that wait: one second.
+const MAX_READINGS: usize = 1000;
+/// Truth images that wait.
+const MAX_TRUTH: usize = 8;
+/// A player that is later than this skips images.
+const MAX_LATE: Duration = Duration::from_millis(50);
+
+/// Simulated devices that deliver in real time.
+pub struct LiveRig {
+    /// One a camera, in the order of the configuration.
+    pub cameras: Vec<Box<dyn Camera>>,
+    /// The arm's joint readings.
+    pub arm: Box<dyn Arm>,
+    /// Ground truth of the colour images; the oldest goes when nobody takes it.
+    pub truth: LiveTruth,
+    /// What the rig is made of.
+    pub info: RigInfo,
+}
+
+/// Ground truth beside the live devices.
+pub struct LiveTruth {
+    player: Arc<Player>,
+}
+
+impl LiveTruth {
+    /// The oldest truth that was not taken yet, without waiting.
+    pub fn take(&self) -> Option<TruthImage> {
+        self.player.shared.lock().truth.pop_front()
+    }
+}
+
+/// The thread that plays; it ends when the last device is dropped.
+struct Player {
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Drop for Player {
+    fn drop(&mut self) {
+        self.shared.lock().stop = true;
+        if let Some(thread) = self.thread.take() {
+            // A panic of the thread was reported by the panic hook.
+            let _ = thread.join();
+        }
+    }
+}
+
+#[derive(Default)]
+struct Shared {
+    state: Mutex<State>,
+    arrived: Condvar,
+}
+
+#[derive(Default)]
+struct State {
+    /// One a camera.
+    images: Vec<VecDeque<Image>>,
+    /// Images of a camera lost and not yet told: colour and depth.
+    lost: Vec<[u64; 2]>,
+    readings: VecDeque<JointState>,
+    truth: VecDeque<TruthImage>,
+    /// Why there will be no more samples.
+    end: Option<String>,
+    stop: bool,
+}
+
+impl LiveRig {
+    pub(crate) fn start(engine: Engine, info: RigInfo, start: Stamp) -> Result<Self, Error> {
+        let names: Vec<Arc<str>> = info.cameras.iter().map(|camera| camera.name.as_str().into()).collect();
+        let shared = Arc::new(Shared::default());
+        {
+            let mut state = shared.lock();
+            state.images = vec![VecDeque::new(); names.len()];
+            state.lost = vec![[0; 2]; names.len()];
+        }
+        let thread = std::thread::Builder::new().name("sim-live".to_owned()).spawn({
+            let shared = Arc::clone(&shared);
+            move || play(engine, &shared, &names, start)
+        });
+        let player = Arc::new(Player { shared, thread: Some(thread.map_err(Error::Thread)?) });
+        let cameras = info.cameras.iter().enumerate().map(|(camera_ix, camera)| {
+            let (name, intrinsics) = (camera.name.clone(), camera.intrinsics.clone());
+            Box::new(LiveCamera { player: Arc::clone(&player), camera_ix, name, intrinsics }) as Box<dyn Camera>
+        });
+        Ok(Self {
+            cameras: cameras.collect(),
+            arm: Box::new(LiveArm { player: Arc::clone(&player), joint_names: info.joint_names.clone() }),
+            truth: LiveTruth { player },
+            info,
+        })
+    }
+}
+
+/// Delivers samples when their time comes, until the rig ends or nobody is left.
+fn play(mut engine: Engine, shared: &Shared, names: &[Arc<str>], start: Stamp) {
+    engine.set_start(start);
+    let began = Instant::now();
+    let end = loop {
+        let late_from = began.elapsed().saturating_sub(MAX_LATE);
+        engine.skip_before(i64::try_from(late_from.as_nanos()).unwrap_or(i64::MAX));
+        match engine.next() {
+            Ok(Some(delivery)) => {
+                wait_until(began, delivery.0);
+                if !shared.deliver(delivery, names) {
+                    return;
+                }
+            }
+            Ok(None) => break "it has played to its end".to_owned(),
+            Err(error) => break error.to_string(),
+        }
+    };
+    shared.lock().end = Some(end);
+    shared.arrived.notify_all();
+}
+
+fn wait_until(began: Instant, nanos: i64) {
+    let due = began + Duration::from_nanos(u64::try_from(nanos).unwrap_or(0));
+    std::thread::sleep(due.saturating_duration_since(Instant::now()));
+}
+
+fn kind(image: &Image) -> usize {
+    usize::from(matches!(image.format, PixelFormat::DepthU16 { .. }))
+}
+
+impl Shared {
+    /// The state, also after a thread panicked while it held it: queues are never left half changed.
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Queues a sample; false when nobody wants it any more.
+    fn deliver(&self, (_, sample): Delivery, names: &[Arc<str>]) -> bool {
+        let mut state = self.lock();
+        match sample {
+            Sample::Image(image) => {
+                if let Some(camera_ix) = names.iter().position(|name| *name == image.camera) {
+                    state.put_image(camera_ix, image);
+                }
+            }
+            Sample::Joints(reading) => put(&mut state.readings, MAX_READINGS, reading),
+            Sample::Truth(truth) => put(&mut state.truth, MAX_TRUTH * names.len(), truth),
+            Sample::Base(_) => {}
+        }
+        let goes_on = !state.stop;
+        drop(state);
+        self.arrived.notify_all();
+        goes_on
+    }
+
+    /// Waits for `take` to find something; an error tells that nothing came, or will come.
+    fn wait<T>(
+        &self,
+        timeout: Duration,
+        mut take: impl FnMut(&mut State) -> Option<T>,
+        silence: impl FnOnce() -> drivers::Error,
+    ) -> Result<T, drivers::Error> {
+        let until = Instant::now() + timeout;
+        let mut state = self.lock();
+        loop {
+            if let Some(sample) = take(&mut state) {
+                return Ok(sample);
+            }
+            if let Some(reason) = &state.end {
+                return Err(drivers::Error::Simulation { reason: reason.clone() });
+            }
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Err(silence());
+            }
+            state = self.arrived.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+}
+
+impl State {
+    /// Queues an image; where there is no room the camera's oldest goes, and the next of its kind tells so.
+    fn put_image(&mut self, camera_ix: usize, mut image: Image) {
+        let queue = &mut self.images[camera_ix];
+        let lost = &mut self.lost[camera_ix];
+        image.n_skipped += std::mem::take(&mut lost[kind(&image)]);
+        queue.push_back(image);
+        if queue.len() <= MAX_IMAGES {
+            return;
+        }
+        let Some(oldest) = queue.pop_front() else { return };
+        let n_lost = oldest.n_skipped + 1;
+        match queue.iter_mut().find(|image| kind(image) == kind(&oldest)) {
+            Some(next) => next.n_skipped += n_lost,
+            None => lost[kind(&oldest)] += n_lost,
+        }
+    }
+}
+
+fn put<T>(queue: &mut VecDeque<T>, max: usize, item: T) {
+    if queue.len() >= max {
+        queue.pop_front();
+    }
+    queue.push_back(item);
+}
+
+struct LiveCamera {
+    player: Arc<Player>,
+    camera_ix: usize,
+    name: String,
+    intrinsics: Intrinsics,
+}
+
+impl Camera for LiveCamera {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn intrinsics(&self) -> &Intrinsics {
+        &self.intrinsics
+    }
+
+    fn next_image(&mut self, timeout: Duration) -> Result<Image, drivers::Error> {
+        let silence = || drivers::Error::NoImage { camera: self.name.clone(), waited: timeout };
+        self.player.shared.wait(timeout, |state| state.images[self.camera_ix].pop_front(), silence)
+    }
+}
+
+struct LiveArm {
+    player: Arc<Player>,
+    joint_names: Vec<String>,
+}
+
+impl Arm for LiveArm {
+    fn joint_names(&self) -> &[String] {
+        &self.joint_names
+    }
+
+    fn read(&mut self, timeout: Duration) -> Result<JointState, drivers::Error> {
+        let silence = || drivers::Error::NoJoints { waited: timeout };
+        self.player.shared.wait(timeout, |state| state.readings.pop_front(), silence)
+    }
+}

@@ -1,0 +1,172 @@
+//! Triangle meshes with normals and texture coordinates, in MuJoCo's binary format.
+
+use nalgebra::{Point3, Vector3};
+
+/// Triangles whose corners carry a normal and a texture coordinate.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Mesh {
+    points_m: Vec<[f32; 3]>,
+    normals: Vec<[f32; 3]>,
+    texcoords: Vec<[f32; 2]>,
+    faces: Vec<[i32; 3]>,
+}
+
+/// One corner; `texcoord` is `(0, 0)` at the texture's top left.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Corner {
+    pub(crate) point_m: Point3<f64>,
+    pub(crate) normal: Vector3<f64>,
+    pub(crate) texcoord: [f64; 2],
+}
+
+/// Texture rectangle: left, top, right, bottom.
+pub(crate) type TextureRect = [f64; 4];
+
+/// The whole texture.
+pub(crate) const WHOLE: TextureRect = [0.0, 0.0, 1.0, 1.0];
+
+impl Mesh {
+    /// Adds a corner and returns its index.
+    #[expect(clippy::cast_possible_truncation, reason = "the format holds f32 and i32")]
+    pub(crate) fn push(&mut self, corner: Corner) -> i32 {
+        let Corner { point_m, normal, texcoord } = corner;
+        self.points_m.push([point_m.x as f32, point_m.y as f32, point_m.z as f32]);
+        self.normals.push([normal.x as f32, normal.y as f32, normal.z as f32]);
+        self.texcoords.push([texcoord[0] as f32, texcoord[1] as f32]);
+        self.points_m.len() as i32 - 1
+    }
+
+    /// Adds a triangle, counter-clockwise from outside.
+    pub(crate) fn triangle(&mut self, corners: [i32; 3]) {
+        self.faces.push(corners);
+    }
+
+    /// Adds a flat rectangle seen from where `right x up` points, its texture upright.
+    pub(crate) fn rectangle(
+        &mut self,
+        center: Point3<f64>,
+        half_right: Vector3<f64>,
+        half_up: Vector3<f64>,
+        texture: TextureRect,
+    ) {
+        let normal = half_right.cross(&half_up).normalize();
+        let [left, top, right, bottom] = texture;
+        let mut corner = |across: f64, up: f64, texcoord| {
+            self.push(Corner { point_m: center + half_right * across + half_up * up, normal, texcoord })
+        };
+        let [a, b, c, d] = [
+            corner(-1.0, -1.0, [left, bottom]),
+            corner(1.0, -1.0, [right, bottom]),
+            corner(1.0, 1.0, [right, top]),
+            corner(-1.0, 1.0, [left, top]),
+        ];
+        self.triangle([a, b, c]);
+        self.triangle([a, c, d]);
+    }
+
+    /// A box around the origin; textures in the order +x, -x, +y, -y, +z, -z.
+    pub(crate) fn cuboid(half_m: [f64; 3], textures: &[TextureRect; 6]) -> Self {
+        let mut mesh = Self::default();
+        for ((outward, right, up), texture) in BOX_FACES.iter().zip(textures) {
+            let scale = |axis: &[f64; 3]| Vector3::new(axis[0] * half_m[0], axis[1] * half_m[1], axis[2] * half_m[2]);
+            mesh.rectangle(Point3::from(scale(outward)), scale(right), scale(up), *texture);
+        }
+        mesh
+    }
+
+    /// An ellipsoid around the origin of a frame given by three half axes.
+    pub(crate) fn add_ellipsoid(
+        &mut self,
+        center: Point3<f64>,
+        half_axes: [Vector3<f64>; 3],
+        n_rings: u32,
+        texture: TextureRect,
+    ) {
+        let n_sectors = 2 * n_rings;
+        let first = i32::try_from(self.points_m.len()).expect("meshes stay small");
+        for ring in 0..=n_rings {
+            for sector in 0..=n_sectors {
+                let down = f64::from(ring) / f64::from(n_rings);
+                let around = f64::from(sector) / f64::from(n_sectors);
+                let direction = sphere_direction(down, around);
+                let point = |direction: &Vector3<f64>| {
+                    half_axes[0] * direction.x + half_axes[1] * direction.y + half_axes[2] * direction.z
+                };
+                let normal = ellipsoid_normal(&half_axes, &direction);
+                let texcoord =
+                    [texture[0] + (texture[2] - texture[0]) * around, texture[1] + (texture[3] - texture[1]) * down];
+                self.push(Corner { point_m: center + point(&direction), normal, texcoord });
+            }
+        }
+        let row = i32::try_from(n_sectors + 1).expect("meshes stay small");
+        for ring in 0..i32::try_from(n_rings).expect("meshes stay small") {
+            for sector in 0..row - 1 {
+                let [a, b] = [first + ring * row + sector, first + (ring + 1) * row + sector];
+                self.triangle([a, b, b + 1]);
+                self.triangle([a, b + 1, a + 1]);
+            }
+        }
+    }
+
+    /// Moves every point.
+    #[expect(clippy::cast_possible_truncation, reason = "the format holds f32")]
+    pub(crate) fn translate(&mut self, by_m: Vector3<f64>) {
+        for point in &mut self.points_m {
+            *point = std::array::from_fn(|axis| (f64::from(point[axis]) + by_m[axis]) as f32);
+        }
+    }
+
+    /// Adds another mesh, moved.
+    pub(crate) fn append(&mut self, mut other: Self, by_m: Vector3<f64>) {
+        other.translate(by_m);
+        let first = i32::try_from(self.points_m.len()).expect("meshes stay small");
+        self.points_m.extend(other.points_m);
+        self.normals.extend(other.normals);
+        self.texcoords.extend(other.texcoords);
+        self.faces.extend(other.faces.iter().map(|face| face.map(|corner| corner + first)));
+    }
+
+    /// The bytes of MuJoCo's `.msh` format: four counts, then points, normals, texture coordinates and faces.
+    pub(crate) fn to_msh(&self) -> Vec<u8> {
+        let n_points = i32::try_from(self.points_m.len()).expect("meshes stay small");
+        let n_faces = i32::try_from(self.faces.len()).expect("meshes stay small");
+        let mut bytes = Vec::new();
+        for count in [n_points, n_points, n_points, n_faces] {
+            bytes.extend(count.to_le_bytes());
+        }
+        for number in
+            self.points_m.iter().flatten().chain(self.normals.iter().flatten()).chain(self.texcoords.iter().flatten())
+        {
+            bytes.extend(number.to_le_bytes());
+        }
+        for index in self.faces.iter().flatten() {
+            bytes.extend(index.to_le_bytes());
+        }
+        bytes
+    }
+}
+
+/// Outward, right and up directions of a box's faces in the order +x, -x, +y, -y, +z, -z; sides stand upright.
+const BOX_FACES: [([f64; 3], [f64; 3], [f64; 3]); 6] = [
+    ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]),
+    ([-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]),
+    ([0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]),
+    ([0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]),
+    ([0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]),
+    ([0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]),
+];
+
+/// Direction on the unit sphere: `down` from 0 at +z to 1 at -z, `around` from 0 to 1 about z.
+pub(crate) fn sphere_direction(down: f64, around: f64) -> Vector3<f64> {
+    let (sin_down, cos_down) = (down * std::f64::consts::PI).sin_cos();
+    let (sin_around, cos_around) = (around * std::f64::consts::TAU).sin_cos();
+    Vector3::new(sin_down * cos_around, sin_down * sin_around, cos_down)
+}
+
+/// Outward normal of an ellipsoid where its unit sphere has `direction`; the half axes are perpendicular.
+pub(crate) fn ellipsoid_normal(half_axes: &[Vector3<f64>; 3], direction: &Vector3<f64>) -> Vector3<f64> {
+    let sum = half_axes[0] * (direction.x / half_axes[0].norm_squared())
+        + half_axes[1] * (direction.y / half_axes[1].norm_squared())
+        + half_axes[2] * (direction.z / half_axes[2].norm_squared());
+    sum.normalize()
+}

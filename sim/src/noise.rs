@@ -1,0 +1,159 @@
+//! Noise of colour and depth images, and the holes of depth images.
+#![expect(clippy::cast_possible_truncation, reason = "values are clamped before they become integers")]
+
+use crate::config::{DepthConfig, SensorConfig};
+use crate::random::Random;
+use rayon::prelude::{
+    IndexedParallelIterator, IntoParallelRefIterator, IntoParallelRefMutIterator, ParallelIterator, ParallelSlice,
+    ParallelSliceMut,
+};
+
+/// Rounds colours to bytes.
+pub(crate) fn to_bytes(colors: &[f32]) -> Vec<u8> {
+    colors.iter().map(|color| to_byte(*color)).collect()
+}
+
+fn to_byte(value: f32) -> u8 {
+    (value.clamp(0.0, 255.0) + 0.5) as u8
+}
+
+/// Adds shot and read noise to `[height, width, 3]` colours of 0 to 255.
+pub(crate) fn add_color_noise(colors: &[f32], sensor: &SensorConfig, random: Random) -> Vec<u8> {
+    const PIXELS_A_CHUNK: usize = 640;
+    let sigma: [f32; 256] = std::array::from_fn(|level| noise_sigma(sensor, level as f64) as f32);
+    let mut bytes = vec![0; colors.len()];
+    bytes.par_chunks_mut(3 * PIXELS_A_CHUNK).zip(colors.par_chunks(3 * PIXELS_A_CHUNK)).enumerate().for_each(
+        |(chunk, (bytes, colors))| {
+            for (ix, (bytes, colors)) in bytes.chunks_exact_mut(3).zip(colors.chunks_exact(3)).enumerate() {
+                let normals = random.normals((chunk * PIXELS_A_CHUNK + ix) as u64);
+                for channel in 0..3 {
+                    let level = usize::from(to_byte(colors[channel]));
+                    bytes[channel] = to_byte(sigma[level].mul_add(normals[channel], colors[channel]));
+                }
+            }
+        },
+    );
+    bytes
+}
+
+/// Standard deviation of the noise at a level of 0 to 255.
+pub(crate) fn noise_sigma(sensor: &SensorConfig, level: f64) -> f64 {
+    const MID_GRAY: f64 = 128.0;
+    sensor.noise_sigma * (1.0 - sensor.shot_frac + sensor.shot_frac * level / MID_GRAY).max(0.0).sqrt()
+}
+
+/// PSNR in dB of bytes against colours rounded to bytes; infinite where they are the same.
+pub(crate) fn psnr(bytes: &[u8], colors: &[f32]) -> f64 {
+    let squares = bytes.par_iter().zip(colors).map(|(byte, color)| u64::from(byte.abs_diff(to_byte(*color))).pow(2));
+    let mean_square = squares.sum::<u64>() as f64 / bytes.len() as f64;
+    10.0 * (255.0 * 255.0 / mean_square).log10()
+}
+
+/// Turns true depth into counts: noise, range limits, holes, quantisation. 0 is a hole.
+pub(crate) fn depth_counts(
+    depth_m: &[f32],
+    width: usize,
+    depth: &DepthConfig,
+    random: Random,
+    ideal: bool,
+) -> Vec<u16> {
+    let in_range = |metres: f32| f64::from(metres) >= depth.min_m && f64::from(metres) <= depth.max_m;
+    let to_count = |metres: f64| (metres / depth.metres_per_count).clamp(0.0, f64::from(u16::MAX)).round() as u16;
+    if ideal {
+        return depth_m.iter().map(|&metres| if in_range(metres) { to_count(metres.into()) } else { 0 }).collect();
+    }
+    let holes = Holes::new(depth_m, width, depth.hole_frac, random);
+    let mut counts = vec![0; depth_m.len()];
+    counts.par_iter_mut().enumerate().for_each(|(ix, count)| {
+        let metres = depth_m[ix];
+        if in_range(metres) && !holes.contains(ix) {
+            let normal = f64::from(random.normals(ix as u64)[0]);
+            let metres = f64::from(metres);
+            *count = to_count(metres + depth.noise_sigma_m * metres * metres * normal);
+        }
+    });
+    counts
+}
+
+/// Where a stereo camera finds no match: beside depth edges first, then in small clusters.
+struct Holes<'a> {
+    depth_m: &'a [f32],
+    width: usize,
+    random: Random,
+    edge_share: f64,
+    cluster_share: f64,
+}
+
+/// Most edge pixels that may be holes.
+const MAX_EDGE_SHARE: f64 = 0.6;
+/// Side of a cluster of holes, pixels.
+const CLUSTER_PX: usize = 4;
+/// Counters of the holes start here, beyond those of the noise.
+const HOLE_COUNTERS: u64 = 1 << 40;
+
+impl<'a> Holes<'a> {
+    fn new(depth_m: &'a [f32], width: usize, hole_frac: f64, random: Random) -> Self {
+        let mut holes = Self { depth_m, width, random, edge_share: 0.0, cluster_share: 0.0 };
+        let n_edge = (0..depth_m.len()).filter(|&ix| holes.is_edge(ix)).count() as f64;
+        let n_wanted = hole_frac * depth_m.len() as f64;
+        holes.edge_share = (0.7 * n_wanted / n_edge.max(1.0)).min(MAX_EDGE_SHARE);
+        let n_rest = depth_m.len() as f64 - n_edge;
+        holes.cluster_share = ((n_wanted - holes.edge_share * n_edge) / n_rest.max(1.0)).clamp(0.0, 1.0);
+        holes
+    }
+
+    /// Whether depth jumps within two pixels to the left or right, where one eye sees what the other does not.
+    fn is_edge(&self, ix: usize) -> bool {
+        const JUMP_FRAC: f32 = 0.03;
+        let column = ix % self.width;
+        let (before, after) = (ix - column.min(2), ix + (self.width - 1 - column).min(2));
+        let (a, b) = (self.depth_m[before], self.depth_m[after]);
+        (a - b).abs() > JUMP_FRAC * a.min(b)
+    }
+
+    fn contains(&self, ix: usize) -> bool {
+        if self.is_edge(ix) {
+            return self.random.unit(HOLE_COUNTERS + ix as u64) < self.edge_share;
+        }
+        let (row, column) = (ix / self.width, ix % self.width);
+        let cluster = (row / CLUSTER_PX * self.width + column / CLUSTER_PX) as u64;
+        self.random.unit(2 * HOLE_COUNTERS + cluster) < self.cluster_share
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn color_noise_has_the_configured_sigma_and_grows_with_brightness() {
+        let sensor = SensorConfig::default();
+        for level in [40.0, 128.0, 200.0] {
+            let colors = vec![level as f32; 3 * 100_000];
+            let bytes = add_color_noise(&colors, &sensor, Random::new(1, &[2]));
+            let n = bytes.len() as f64;
+            let mean = bytes.iter().map(|byte| f64::from(*byte)).sum::<f64>() / n;
+            let variance = bytes.iter().map(|byte| (f64::from(*byte) - mean).powi(2)).sum::<f64>() / n;
+            // Rounding to bytes adds a twelfth.
+            let expected = noise_sigma(&sensor, level).powi(2) + 1.0 / 12.0;
+            assert!((variance / expected - 1.0).abs() < 0.03, "{level}: {variance} against {expected}");
+            assert!((mean - level).abs() < 0.05);
+        }
+        assert!((noise_sigma(&sensor, 128.0) - 2.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn depth_has_the_configured_noise_holes_and_limits() {
+        let depth = DepthConfig::default();
+        let plane = vec![1.0_f32; 640 * 480];
+        let counts = depth_counts(&plane, 640, &depth, Random::new(1, &[3]), false);
+        let metres: Vec<f64> =
+            counts.iter().filter(|count| **count > 0).map(|count| f64::from(*count) * 1e-4).collect();
+        let holes = 1.0 - metres.len() as f64 / plane.len() as f64;
+        let sigma = (metres.iter().map(|z| (z - 1.0).powi(2)).sum::<f64>() / metres.len() as f64).sqrt();
+        assert!((holes - 0.02).abs() < 0.003, "{holes}");
+        assert!((sigma - 0.0015).abs() < 0.00005, "{sigma}");
+        let near = depth_counts(&[0.05, 7.0, 0.5], 3, &depth, Random::new(1, &[3]), true);
+        assert_eq!(near, [0, 0, 5000]);
+    }
+}

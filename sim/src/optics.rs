@@ -1,0 +1,225 @@
+//! From a drawn pinhole picture to what the sensor's pixels see: lens, rolling shutter, motion blur.
+#![expect(clippy::cast_possible_truncation, reason = "pixel positions are clamped to the picture before the cast")]
+
+use crate::Error;
+use crate::config::CameraConfig;
+use crate::panda::Joints;
+use crate::render::{Picture, View};
+use kinematics::{Intrinsics, Transform};
+use nalgebra::{Matrix3, Vector3};
+use rayon::prelude::{IndexedParallelIterator, ParallelIterator, ParallelSliceMut};
+
+/// The optics of one camera, worked out once.
+#[derive(Clone, Debug)]
+pub(crate) struct Optics {
+    intrinsics: Intrinsics,
+    supersample: u32,
+    /// `[height, width]`: x and y of the point at z = 1 that each pixel's centre sees.
+    rays: Vec<[f32; 2]>,
+    /// Size and pinhole of the pictures to draw: the image and a margin, supersampled.
+    view_size_px: [u32; 2],
+    view_focal_px: [f64; 2],
+    view_principal_px: [f64; 2],
+}
+
+/// Pose of the drawn picture as seen by the camera at another instant, in f32.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Shift {
+    turn: Matrix3<f32>,
+    offset_m: Vector3<f32>,
+}
+
+impl Shift {
+    pub(crate) fn new(drawn_from_camera: &Transform) -> Self {
+        Self {
+            turn: drawn_from_camera.rotation.to_rotation_matrix().matrix().cast(),
+            offset_m: drawn_from_camera.translation.vector.cast(),
+        }
+    }
+}
+
+/// Corrections of the pixel position until the depth found there agrees with the ray.
+const N_CORRECTIONS: usize = 3;
+
+impl Optics {
+    pub(crate) fn new(camera: &CameraConfig, is_sharp: bool) -> Result<Self, Error> {
+        let intrinsics = camera.intrinsics.clone();
+        let [width, height] = intrinsics.size_px;
+        let mut rays = Vec::with_capacity(width as usize * height as usize);
+        for row in 0..height {
+            for column in 0..width {
+                let pixel = [f64::from(column) + 0.5, f64::from(row) + 0.5];
+                let point =
+                    intrinsics.unproject(pixel).ok_or_else(|| Error::Lens { camera: camera.name.clone(), pixel })?;
+                rays.push([point.x as f32, point.y as f32]);
+            }
+        }
+        // Room for what shear and blur bring in from outside: a few pixels at the speeds of the arm.
+        let margin_px = if is_sharp { 0 } else { 4 + height / 60 };
+        let supersample = camera.sensor.supersample;
+        let mut optics = Self {
+            view_size_px: [0; 2],
+            view_focal_px: intrinsics.focal_px.map(|focal| focal * f64::from(supersample)),
+            view_principal_px: [0.0; 2],
+            intrinsics,
+            supersample,
+            rays,
+        };
+        for axis in 0..2 {
+            let (first, last) = optics.bounds(axis);
+            let margin = f64::from(margin_px * supersample);
+            optics.view_principal_px[axis] = margin - first * optics.view_focal_px[axis];
+            // Rounding noise must not add a pixel.
+            let extent = ((last - first) * optics.view_focal_px[axis] + 2.0 * margin - 1e-2).ceil();
+            optics.view_size_px[axis] = extent.clamp(1.0, f64::from(MAX_VIEW_PX)) as u32;
+        }
+        Ok(optics)
+    }
+
+    /// Smallest and largest coordinate at z = 1 that the image's pixels cover along an axis.
+    fn bounds(&self, axis: usize) -> (f64, f64) {
+        let half_pixel = 0.5 / self.intrinsics.focal_px[axis];
+        if self.intrinsics.is_pinhole() {
+            let [principal, focal] = [self.intrinsics.principal_px[axis], self.intrinsics.focal_px[axis]];
+            return (-principal / focal, (f64::from(self.intrinsics.size_px[axis]) - principal) / focal);
+        }
+        let values = self.rays.iter().map(|ray| f64::from(ray[axis]));
+        let (first, last) = values.fold((f64::MAX, f64::MIN), |(first, last), x| (first.min(x), last.max(x)));
+        (first - half_pixel, last + half_pixel)
+    }
+
+    /// Size of the pictures to draw.
+    pub(crate) fn view_size_px(&self) -> [u32; 2] {
+        self.view_size_px
+    }
+
+    /// The picture to draw for a pose.
+    pub(crate) fn view(&self, world_from_camera: Transform, arm_rad: Option<Joints>) -> View {
+        View {
+            size_px: self.view_size_px,
+            focal_px: self.view_focal_px,
+            principal_px: self.view_principal_px,
+            world_from_camera,
+            arm_rad,
+        }
+    }
+
+    /// What each pixel sees at the picture's own instant: `[height, width, 3]`, 0 to 255.
+    pub(crate) fn sharp(&self, picture: &Picture) -> Vec<f32> {
+        self.expose(|row, colors| {
+            for (color, ray) in colors.iter_mut().zip(self.row_of_rays(row)) {
+                *color = self.color_at(picture, self.drawn_from_ray(ray));
+            }
+        })
+    }
+
+    /// What each pixel sees when its row is exposed at other instants, of which the mean counts.
+    ///
+    /// `shifts` holds those of the first row, then of the second. A pixel's ray is followed into the drawn picture with
+    /// the depth drawn there, so surfaces land where they belong; only a strip beside a depth edge, as wide as the edge's
+    /// own parallax over the readout, repeats what lies beside it.
+    pub(crate) fn moving(&self, picture: &Picture, shifts: &[Shift]) -> Vec<f32> {
+        let n_samples = shifts.len() / self.intrinsics.size_px[1] as usize;
+        let share = 1.0 / n_samples as f32;
+        self.expose(|row, colors| {
+            for shift in &shifts[row * n_samples..(row + 1) * n_samples] {
+                for (color, ray) in colors.iter_mut().zip(self.row_of_rays(row)) {
+                    let seen = self.color_at(picture, self.follow(picture, shift, ray));
+                    for channel in 0..3 {
+                        color[channel] += share * seen[channel];
+                    }
+                }
+            }
+        })
+    }
+
+    /// Depth along z at the centre of each pixel, `[height, width]`, metres.
+    pub(crate) fn depth_m(&self, picture: &Picture) -> Vec<f32> {
+        let [width, height] = self.intrinsics.size_px.map(|side| side as usize);
+        let mut depth_m = vec![0.0; width * height];
+        depth_m.par_chunks_mut(width).enumerate().for_each(|(row, line)| {
+            for (depth, ray) in line.iter_mut().zip(self.row_of_rays(row)) {
+                *depth = self.depth_at(picture, self.drawn_from_ray(ray));
+            }
+        });
+        depth_m
+    }
+
+    fn row_of_rays(&self, row: usize) -> &[[f32; 2]] {
+        let width = self.intrinsics.size_px[0] as usize;
+        &self.rays[row * width..(row + 1) * width]
+    }
+
+    fn expose(&self, paint: impl Fn(usize, &mut [[f32; 3]]) + Sync) -> Vec<f32> {
+        let [width, height] = self.intrinsics.size_px.map(|side| side as usize);
+        let mut colors = vec![[0.0; 3]; width * height];
+        colors.par_chunks_mut(width).enumerate().for_each(|(row, line)| paint(row, line));
+        colors.into_flattened()
+    }
+
+    /// Position in the drawn picture of the point `(x, y, 1)`.
+    fn drawn_from_ray(&self, ray: &[f32; 2]) -> [f32; 2] {
+        [0, 1].map(|axis| ray[axis].mul_add(self.view_focal_px[axis] as f32, self.view_principal_px[axis] as f32))
+    }
+
+    fn follow(&self, picture: &Picture, shift: &Shift, ray: &[f32; 2]) -> [f32; 2] {
+        let direction = shift.turn * Vector3::new(ray[0], ray[1], 1.0);
+        let mut drawn = self.drawn_from_ray(ray);
+        for _ in 0..N_CORRECTIONS {
+            let along = (nearest_depth(picture, drawn) - shift.offset_m.z) / direction.z;
+            let point = direction * along + shift.offset_m;
+            drawn = self.drawn_from_ray(&[point.x / point.z, point.y / point.z]);
+        }
+        drawn
+    }
+
+    /// Mean colour of the square of one image pixel around a position in the drawn picture.
+    fn color_at(&self, picture: &Picture, at: [f32; 2]) -> [f32; 3] {
+        let side = self.supersample as usize;
+        let [width, height] = picture.size_px.map(|side| side as usize);
+        let start = |axis: usize, size: usize| {
+            let first = (at[axis] - 0.5 * side as f32).clamp(0.0, (size - side) as f32 - 1e-3);
+            (first as usize, first.fract())
+        };
+        let ((column, share_x), (row, share_y)) = (start(0, width), start(1, height));
+        let weight = |ix: usize, share: f32| match ix {
+            0 => 1.0 - share,
+            ix if ix == side => share,
+            _ => 1.0,
+        };
+        let mut sum = [0.0; 3];
+        for y in 0..=side {
+            let line = &picture.rgb[3 * ((row + y) * width + column)..][..3 * (side + 1)];
+            for x in 0..=side {
+                let weight = weight(x, share_x) * weight(y, share_y);
+                for channel in 0..3 {
+                    sum[channel] += weight * f32::from(line[3 * x + channel]);
+                }
+            }
+        }
+        let area = (side * side) as f32;
+        sum.map(|channel| channel / area)
+    }
+
+    /// Depth at a position in the drawn picture: the mean of what surrounds it on one surface, else the nearest of it.
+    fn depth_at(&self, picture: &Picture, at: [f32; 2]) -> f32 {
+        /// Neighbours further apart than this share belong to different surfaces.
+        const SAME_SURFACE_FRAC: f32 = 0.01;
+        if self.supersample % 2 == 1 {
+            return nearest_depth(picture, at);
+        }
+        let around = [[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]];
+        let depths = around.map(|[dx, dy]: [f32; 2]| nearest_depth(picture, [at[0] + dx, at[1] + dy]));
+        let nearest = depths.into_iter().fold(f32::MAX, f32::min);
+        let furthest = depths.into_iter().fold(0.0, f32::max);
+        if furthest - nearest < SAME_SURFACE_FRAC * nearest { depths.iter().sum::<f32>() / 4.0 } else { nearest }
+    }
+}
+
+/// Larger pictures are not drawn, whatever the lens.
+const MAX_VIEW_PX: u32 = 8192;
+
+fn nearest_depth(picture: &Picture, at: [f32; 2]) -> f32 {
+    let index = |axis: usize| (at[axis].max(0.0) as usize).min(picture.size_px[axis] as usize - 1);
+    picture.depth_m[index(1) * picture.size_px[0] as usize + index(0)]
+}

@@ -1,0 +1,194 @@
+//! Draws the scene on a thread of its own: one OpenGL context for all cameras.
+#![expect(unsafe_code, reason = "the scene's cameras are set through MuJoCo's C structs")]
+#![expect(clippy::cast_possible_truncation, reason = "OpenGL works in f32")]
+
+use crate::Error;
+use crate::egl::HeadlessContext;
+use crate::panda::Joints;
+use crate::scene::{ARM_GROUP, NEAR_FAR_M};
+use crossbeam_channel::{Receiver, Sender, bounded};
+use kinematics::Transform;
+use mujoco_rs::prelude::{MjData, MjModel, MjrContext, MjrRectangle, MjvCamera, MjvOption, MjvPerturb, MjvScene};
+use nalgebra::Vector3;
+use std::sync::Arc;
+use std::thread::JoinHandle;
+
+/// What to draw: a pinhole picture.
+#[derive(Clone, Debug)]
+pub(crate) struct View {
+    pub(crate) size_px: [u32; 2],
+    pub(crate) focal_px: [f64; 2],
+    pub(crate) principal_px: [f64; 2],
+    pub(crate) world_from_camera: Transform,
+    /// Where the arm is; not drawn, and without a shadow, when `None`.
+    pub(crate) arm_rad: Option<Joints>,
+}
+
+/// A drawn picture, from the top left.
+#[derive(Clone, Debug)]
+pub(crate) struct Picture {
+    pub(crate) size_px: [u32; 2],
+    /// `[height, width, 3]`, sRGB.
+    pub(crate) rgb: Vec<u8>,
+    /// `[height, width]`, metres along z.
+    pub(crate) depth_m: Vec<f32>,
+}
+
+/// Hands views to the render thread; dropping it ends the thread.
+pub(crate) struct Renderer {
+    jobs: Option<Sender<Job>>,
+    thread: Option<JoinHandle<()>>,
+    name: String,
+}
+
+struct Job {
+    view: View,
+    reply: Sender<Picture>,
+}
+
+/// A picture that is being drawn.
+pub(crate) struct Pending(Receiver<Picture>);
+
+impl Pending {
+    /// Waits for the picture.
+    pub(crate) fn wait(self) -> Result<Picture, Error> {
+        self.0.recv().map_err(|_| stopped())
+    }
+}
+
+fn stopped() -> Error {
+    Error::Stopped { reason: "it did not answer".to_owned() }
+}
+
+impl Renderer {
+    /// Starts the thread and its context.
+    pub(crate) fn start(model: Arc<MjModel>) -> Result<Self, Error> {
+        let (jobs, queue) = bounded::<Job>(4);
+        let (ready, started) = bounded(1);
+        let thread = std::thread::Builder::new()
+            .name("sim-render".to_owned())
+            .spawn(move || match HeadlessContext::open() {
+                Ok(context) => {
+                    // A closed channel means that the rig is gone already.
+                    let _ = ready.send(Ok(context.renderer().to_owned()));
+                    draw_all(&context, &model, &queue);
+                }
+                Err(error) => {
+                    let _ = ready.send(Err(error));
+                }
+            })
+            .map_err(Error::Thread)?;
+        let name = started.recv().map_err(|_| stopped())??;
+        Ok(Self { jobs: Some(jobs), thread: Some(thread), name })
+    }
+
+    /// What draws, as OpenGL names it.
+    pub(crate) fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Queues a view; the picture is asked for later.
+    pub(crate) fn submit(&self, view: View) -> Result<Pending, Error> {
+        let (reply, picture) = bounded(1);
+        let jobs = self.jobs.as_ref().ok_or_else(stopped)?;
+        jobs.send(Job { view, reply }).map_err(|_| stopped())?;
+        Ok(Pending(picture))
+    }
+}
+
+impl Drop for Renderer {
+    fn drop(&mut self) {
+        self.jobs = None;
+        if let Some(thread) = self.thread.take() {
+            // A panic of the thread was reported by the panic hook; there is nothing left to do here.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Draws until the last sender is gone. The context outlives everything that MuJoCo made in it.
+fn draw_all(_current: &HeadlessContext, model: &Arc<MjModel>, queue: &Receiver<Job>) {
+    // SAFETY: an OpenGL context is current on this thread until after `Canvas` is dropped; only this model is drawn.
+    let mut context = unsafe { MjrContext::new(model) };
+    context.offscreen();
+    let mut canvas = Canvas {
+        scene: MjvScene::new(model, usize::try_from(model.ffi().ngeom).unwrap_or(0) + 16),
+        data: MjData::new(Arc::clone(model)),
+        context,
+    };
+    for job in queue {
+        // The asker may have given up; the next one may not.
+        let _ = job.reply.send(canvas.draw(&job.view));
+    }
+}
+
+struct Canvas {
+    scene: MjvScene,
+    data: MjData<Arc<MjModel>>,
+    context: MjrContext,
+}
+
+impl Canvas {
+    fn draw(&mut self, view: &View) -> Picture {
+        let mut options = MjvOption::default();
+        options.geomgroup[ARM_GROUP] = view.arm_rad.is_some().into();
+        if let Some(position) = &view.arm_rad {
+            self.data.qpos_mut().copy_from_slice(position.as_slice());
+        }
+        self.data.forward_kinematics();
+        self.scene.update(&mut self.data, &options, &MjvPerturb::default(), &mut MjvCamera::default());
+        self.aim(view);
+        let [width, height] = view.size_px;
+        let viewport = MjrRectangle::new(0, 0, i32::try_from(width).unwrap_or(0), i32::try_from(height).unwrap_or(0));
+        self.scene.render(&viewport, &self.context);
+        self.read(view.size_px, &viewport)
+    }
+
+    /// Points both of the scene's cameras; MuJoCo draws from their mean.
+    fn aim(&mut self, view: &View) {
+        let [near, far] = NEAR_FAR_M;
+        let pose = &view.world_from_camera;
+        let in_f32 = |vector: Vector3<f64>| [vector.x as f32, vector.y as f32, vector.z as f32];
+        let [width, height] = view.size_px.map(f64::from);
+        let at_near = |pixels: f64, axis: usize| pixels * near / view.focal_px[axis];
+        let [left, right] = [at_near(-view.principal_px[0], 0), at_near(width - view.principal_px[0], 0)];
+        // SAFETY: only cameras and flags are written, which hold plain numbers.
+        let scene = unsafe { self.scene.ffi_mut() };
+        for camera in &mut scene.camera {
+            camera.pos = in_f32(pose.translation.vector);
+            camera.forward = in_f32(pose.rotation * Vector3::z());
+            camera.up = in_f32(pose.rotation * -Vector3::y());
+            camera.frustum_center = (0.5 * (left + right)) as f32;
+            camera.frustum_width = (0.5 * (right - left)) as f32;
+            camera.frustum_top = at_near(view.principal_px[1], 1) as f32;
+            camera.frustum_bottom = at_near(view.principal_px[1] - height, 1) as f32;
+            camera.frustum_near = near as f32;
+            camera.frustum_far = far as f32;
+            camera.orthographic = 0;
+        }
+    }
+
+    fn read(&self, size_px: [u32; 2], viewport: &MjrRectangle) -> Picture {
+        let [width, height] = size_px.map(|side| side as usize);
+        let mut from_bottom = vec![0; 3 * width * height];
+        let mut depth_from_bottom = vec![0.0; width * height];
+        self.context
+            .read_pixels(Some(&mut from_bottom), Some(&mut depth_from_bottom), viewport)
+            .expect("the buffers have the viewport's size");
+        let mut rgb = Vec::with_capacity(from_bottom.len());
+        let mut depth_m = Vec::with_capacity(depth_from_bottom.len());
+        for row in (0..height).rev() {
+            rgb.extend_from_slice(&from_bottom[3 * width * row..3 * width * (row + 1)]);
+            depth_m.extend(
+                depth_from_bottom[width * row..width * (row + 1)].iter().map(|depth| metres_from_depth(*depth)),
+            );
+        }
+        Picture { size_px, rgb, depth_m }
+    }
+}
+
+/// Inverts the perspective projection's depth, 0 at the near plane and 1 at the far plane.
+fn metres_from_depth(depth: f32) -> f32 {
+    let [near, far] = NEAR_FAR_M.map(|metres| metres as f32);
+    near * far / (far - depth * (far - near))
+}

@@ -1,0 +1,170 @@
+//! The scanning motion: where the camera is meant to be over time, and the joint positions that bring it there.
+
+use crate::Error;
+use crate::config::N_JOINTS;
+use crate::panda::{self, Jacobian, Joints};
+use crate::scene::{TABLE_Z_M, TARGET_XY_M};
+use kinematics::Transform;
+use nalgebra::{Matrix3, Matrix6, Rotation3, SMatrix, Translation3, UnitQuaternion, Vector3, Vector6};
+use std::f64::consts::TAU;
+
+/// The tour around the target area.
+///
+/// Azimuth, elevation, distance, roll and the point looked at swing with periods that have no common multiple, so
+/// the first seconds cover the whole range coarsely and later ones fill the gaps. Every swing goes both ways and its
+/// speed changes all the time, so that a clock offset and a hand-eye error leave different traces.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Scan {
+    speed: f64,
+}
+
+/// One swinging quantity: mean, amplitude, period in seconds at speed 1, phase in turns.
+struct Swing(f64, f64, f64, f64);
+
+impl Swing {
+    fn at(&self, secs: f64) -> f64 {
+        let Self(mean, amplitude, period_secs, phase) = self;
+        mean + amplitude * ((secs / period_secs + phase) * TAU).sin()
+    }
+}
+
+const AZIMUTH_DEGREES: Swing = Swing(0.0, 45.0, 11.3, -0.20);
+const ELEVATION_DEGREES: Swing = Swing(40.0, 20.0, 7.1, 0.35);
+const DISTANCE_M: Swing = Swing(0.35, 0.10, 9.2, 0.10);
+const ROLL_DEGREES: Swing = Swing(0.0, 20.0, 8.3, 0.60);
+const LOOK_X_M: Swing = Swing(0.0, 0.03, 6.3, 0.0);
+const LOOK_Y_M: Swing = Swing(0.0, 0.04, 7.7, 0.5);
+/// Height of the point looked at above the table, metres.
+const LOOK_ABOVE_M: f64 = 0.06;
+/// The motion starts from rest within this time, seconds.
+const START_SECS: f64 = 0.5;
+/// The speed swings by this share, with this period in seconds.
+const SPEED_SWING: (f64, f64) = (0.35, 4.9);
+
+impl Scan {
+    pub(crate) fn new(speed: f64) -> Self {
+        Self { speed }
+    }
+
+    /// Progress along the tour, in seconds at even speed; starts at rest.
+    fn progress(&self, secs: f64) -> f64 {
+        let (share, period_secs) = SPEED_SWING;
+        // The integral of a ramp from 0 to 1 whose slope is smooth at both ends.
+        let ramp = (secs / START_SECS).clamp(0.0, 1.0);
+        let started = START_SECS * (ramp.powi(3) - 0.5 * ramp.powi(4)) + (secs - START_SECS).max(0.0);
+        let even = started * self.speed;
+        even + share * period_secs / TAU * (1.0 - (even * TAU / period_secs).cos())
+    }
+
+    /// Where the camera should be: x right, y down, z to the point looked at.
+    pub(crate) fn world_from_camera(&self, secs: f64) -> Transform {
+        let at = self.progress(secs);
+        let (azimuth, elevation) = (AZIMUTH_DEGREES.at(at).to_radians(), ELEVATION_DEGREES.at(at).to_radians());
+        let target =
+            Vector3::new(TARGET_XY_M[0] + LOOK_X_M.at(at), TARGET_XY_M[1] + LOOK_Y_M.at(at), TABLE_Z_M + LOOK_ABOVE_M);
+        let back = Vector3::new(-elevation.cos() * azimuth.cos(), -elevation.cos() * azimuth.sin(), elevation.sin());
+        let forward = -back;
+        let right = forward.cross(&Vector3::z()).normalize();
+        let axes = Matrix3::from_columns(&[right, forward.cross(&right), forward]);
+        let upright = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
+        let roll = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), ROLL_DEGREES.at(at).to_radians());
+        Transform::from_parts(Translation3::from(target + back * DISTANCE_M.at(at)), upright * roll)
+    }
+}
+
+/// Follows the scan in joint space by damped least squares, inside the joint limits.
+#[derive(Clone, Debug)]
+pub(crate) struct Follower {
+    scan: Scan,
+    flange_from_camera: Transform,
+    position_rad: Joints,
+    velocity_rad_s: Joints,
+}
+
+/// Where the arm likes to be: far from its limits, elbow up.
+const COMFORTABLE_RAD: [f64; N_JOINTS] = [0.0, -0.3, 0.0, -2.2, 0.0, 2.2, std::f64::consts::FRAC_PI_4];
+/// Distance kept from the joint limits, radians.
+const LIMIT_MARGIN_RAD: f64 = 0.05;
+/// Share of the joints' largest speed that the scan uses.
+const SPEED_SHARE: f64 = 0.5;
+/// Damping of the least squares, in metres and radians.
+const DAMPING: f64 = 0.03;
+/// How fast pose errors and discomfort fade, per second.
+const POSE_GAIN_HZ: f64 = 8.0;
+const COMFORT_GAIN_HZ: f64 = 0.6;
+/// The joint velocity follows its wish with this time constant, seconds: what keeps the motion smooth.
+const SMOOTHING_SECS: f64 = 0.03;
+
+impl Follower {
+    /// Starts at rest, at the scan's first pose.
+    pub(crate) fn new(scan: Scan, flange_from_camera: Transform) -> Result<Self, Error> {
+        const TOLERANCE: f64 = 0.02;
+        let mut follower = Self {
+            scan,
+            flange_from_camera,
+            position_rad: Joints::from(COMFORTABLE_RAD),
+            velocity_rad_s: Joints::zeros(),
+        };
+        let wanted = scan.world_from_camera(0.0);
+        for _ in 0..3000 {
+            let step = follower.wish(&wanted, &Vector6::zeros()) * 0.01;
+            follower.position_rad = clamp_to_limits(follower.position_rad + step);
+        }
+        let base_from_camera = panda::base_from_flange(&follower.position_rad) * flange_from_camera;
+        if pose_error(&wanted, &base_from_camera).norm() > TOLERANCE {
+            return Err(Error::Unreachable { at_secs: 0.0 });
+        }
+        Ok(follower)
+    }
+
+    pub(crate) fn position_rad(&self) -> &Joints {
+        &self.position_rad
+    }
+
+    pub(crate) fn velocity_rad_s(&self) -> &Joints {
+        &self.velocity_rad_s
+    }
+
+    /// Moves on to a time, `step_secs` after the previous one.
+    pub(crate) fn advance(&mut self, secs: f64, step_secs: f64) {
+        let wanted = self.scan.world_from_camera(secs);
+        let before = self.scan.world_from_camera(secs - step_secs);
+        let wanted_twist = pose_error(&wanted, &before) / step_secs;
+        let wish = self.wish(&wanted, &wanted_twist);
+        let limit = |ix: usize| SPEED_SHARE * panda::MAX_SPEED_RAD_S[ix];
+        let wish = Joints::from_fn(|ix, _| wish[ix].clamp(-limit(ix), limit(ix)));
+        self.velocity_rad_s += (wish - self.velocity_rad_s) * (step_secs / SMOOTHING_SECS);
+        let position = clamp_to_limits(self.position_rad + self.velocity_rad_s * step_secs);
+        self.velocity_rad_s = (position - self.position_rad) / step_secs;
+        self.position_rad = position;
+    }
+
+    /// Joint velocity that would bring the camera to the wanted pose, and the free joint motion to a comfortable one.
+    fn wish(&self, wanted: &Transform, wanted_twist: &Vector6<f64>) -> Joints {
+        let (base_from_camera, jacobian) = panda::jacobian(&self.position_rad, &self.flange_from_camera);
+        let twist = wanted_twist + pose_error(wanted, &base_from_camera) * POSE_GAIN_HZ;
+        let comfort = (Joints::from(COMFORTABLE_RAD) - self.position_rad) * COMFORT_GAIN_HZ;
+        let inverse = damped_inverse(&jacobian);
+        comfort + inverse * (twist - jacobian * comfort)
+    }
+}
+
+fn damped_inverse(jacobian: &Jacobian) -> SMatrix<f64, N_JOINTS, 6> {
+    let square = jacobian * jacobian.transpose() + Matrix6::identity() * DAMPING.powi(2);
+    let inverse = square.try_inverse().expect("a damped square is positive definite");
+    jacobian.transpose() * inverse
+}
+
+/// Translation and rotation from the actual to the wanted pose, along the world's axes.
+fn pose_error(wanted: &Transform, actual: &Transform) -> Vector6<f64> {
+    let shift = wanted.translation.vector - actual.translation.vector;
+    let turn = (wanted.rotation * actual.rotation.inverse()).scaled_axis();
+    Vector6::new(shift.x, shift.y, shift.z, turn.x, turn.y, turn.z)
+}
+
+fn clamp_to_limits(position_rad: Joints) -> Joints {
+    let clamp = |ix: usize| {
+        position_rad[ix].clamp(panda::LOWER_RAD[ix] + LIMIT_MARGIN_RAD, panda::UPPER_RAD[ix] - LIMIT_MARGIN_RAD)
+    };
+    Joints::from_fn(|ix, _| clamp(ix))
+}

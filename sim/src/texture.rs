@@ -1,0 +1,306 @@
+//! Pictures painted by noise and simple shapes: walls, table, wood, fur, tags.
+#![expect(clippy::cast_possible_truncation, reason = "colours are clamped before they become bytes")]
+
+use crate::random::Random;
+use crate::tag;
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ExtendedColorType, ImageEncoder};
+
+/// Colour, sRGB 0 to 1.
+pub(crate) type Color = [f64; 3];
+
+/// A square picture, sRGB.
+pub(crate) struct Texture {
+    side_px: usize,
+    rgb: Vec<u8>,
+}
+
+impl Texture {
+    /// Paints every pixel by its position, both coordinates from 0 to 1, from the top left.
+    fn paint(side_px: usize, color_at: impl Fn(f64, f64) -> Color) -> Self {
+        let mut rgb = Vec::with_capacity(3 * side_px * side_px);
+        for row in 0..side_px {
+            for column in 0..side_px {
+                let at = |ix: usize| (ix as f64 + 0.5) / side_px as f64;
+                rgb.extend(color_at(at(column), at(row)).map(to_byte));
+            }
+        }
+        Self { side_px, rgb }
+    }
+
+    /// The texture as a PNG file.
+    pub(crate) fn to_png(&self) -> Result<Vec<u8>, image::ImageError> {
+        let mut bytes = Vec::new();
+        let side = u32::try_from(self.side_px).expect("textures stay small");
+        PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Up).write_image(
+            &self.rgb,
+            side,
+            side,
+            ExtendedColorType::Rgb8,
+        )?;
+        Ok(bytes)
+    }
+}
+
+/// Side of every texture, pixels.
+const SIDE_PX: usize = 1024;
+
+fn to_byte(value: f64) -> u8 {
+    (value.clamp(0.0, 1.0) * 255.0 + 0.5) as u8
+}
+
+fn mix(a: Color, b: Color, share: f64) -> Color {
+    let share = share.clamp(0.0, 1.0);
+    std::array::from_fn(|ix| a[ix] + (b[ix] - a[ix]) * share)
+}
+
+fn scale(color: Color, factor: f64) -> Color {
+    color.map(|channel| channel * factor)
+}
+
+/// 0 below `lower`, 1 above `upper`, smooth between.
+fn step(lower: f64, upper: f64, value: f64) -> f64 {
+    let share = ((value - lower) / (upper - lower)).clamp(0.0, 1.0);
+    share * share * (3.0 - 2.0 * share)
+}
+
+/// Smooth noise, 0 to 1, with features of size 1.
+struct Noise(Random);
+
+impl Noise {
+    fn new(name: u64) -> Self {
+        Self(Random::new(0x7e37, &[name]))
+    }
+
+    fn lattice(&self, x: i64, y: i64) -> f64 {
+        self.0.unit((x as u64) << 32 ^ (y as u64 & 0xffff_ffff))
+    }
+
+    fn at(&self, x: f64, y: f64) -> f64 {
+        let (column, row) = (x.floor(), y.floor());
+        let (fx, fy) = (step(0.0, 1.0, x - column), step(0.0, 1.0, y - row));
+        let (column, row) = (column as i64, row as i64);
+        let top = self.lattice(column, row) * (1.0 - fx) + self.lattice(column + 1, row) * fx;
+        let bottom = self.lattice(column, row + 1) * (1.0 - fx) + self.lattice(column + 1, row + 1) * fx;
+        top * (1.0 - fy) + bottom * fy
+    }
+
+    /// Noise of several sizes, each half as large and half as strong, 0 to 1.
+    fn rough(&self, x: f64, y: f64, n_octaves: i32) -> f64 {
+        let octaves = (0..n_octaves).map(|octave| (f64::from(octave) * 17.3, 2f64.powi(octave)));
+        let sum: f64 = octaves.map(|(shift, finer)| self.at(x * finer + shift, y * finer + shift) / finer).sum();
+        sum / (2.0 - 2f64.powi(1 - n_octaves))
+    }
+}
+
+/// A brick wall with two posters.
+pub(crate) fn brick_wall() -> Texture {
+    const N_COURSES: f64 = 26.0;
+    const N_BRICKS: f64 = 10.0;
+    let (rough, blotch) = (Noise::new(1), Noise::new(2));
+    let each = Random::new(0x7e37, &[3]);
+    Texture::paint(SIDE_PX, |x, y| {
+        let course = (y * N_COURSES).floor();
+        let along = x * N_BRICKS + if course as i64 % 2 == 0 { 0.0 } else { 0.5 };
+        let (in_x, in_y) = (along.fract(), (y * N_COURSES).fract());
+        let wobble = 0.02 * (rough.rough(x * 60.0, y * 60.0, 2) - 0.5);
+        let edge = (in_x.min(1.0 - in_x) * 2.3).min(in_y.min(1.0 - in_y)) + wobble;
+        let brick = each.unit(course as u64 * 64 + along.floor() as u64 % 64);
+        let clay = mix([0.44, 0.19, 0.13], [0.74, 0.42, 0.29], brick);
+        let clay = scale(clay, 0.72 + 0.5 * rough.rough(x * 40.0, y * 40.0, 4));
+        let mortar = scale([0.74, 0.71, 0.66], 0.8 + 0.3 * rough.rough(x * 90.0, y * 90.0, 3));
+        let wall = scale(mix(mortar, clay, step(0.05, 0.10, edge)), 0.85 + 0.25 * blotch.rough(x * 4.0, y * 4.0, 3));
+        let wall = poster(x, y, [0.52, 0.60, 0.78, 0.90], wall, sunrise);
+        poster(x, y, [0.12, 0.68, 0.42, 0.92], wall, squares)
+    })
+}
+
+/// A plaster wall with stains, a map and a striped poster.
+pub(crate) fn plaster_wall() -> Texture {
+    let (rough, stain) = (Noise::new(11), Noise::new(12));
+    Texture::paint(SIDE_PX, |x, y| {
+        let grain = rough.rough(x * 70.0, y * 70.0, 4);
+        let stained = step(0.42, 0.75, stain.rough(x * 5.0, y * 5.0, 5));
+        let wall = scale(mix([0.47, 0.60, 0.62], [0.78, 0.73, 0.58], stained), 0.78 + 0.4 * grain);
+        let crack = (stain.rough(x * 7.0 + 3.0, y * 7.0, 4) - 0.5).abs();
+        let wall = scale(wall, 0.6 + 0.4 * step(0.0, 0.012, crack));
+        let wall = poster(x, y, [0.14, 0.64, 0.50, 0.91], wall, |u, v| map(&stain, u, v));
+        poster(x, y, [0.60, 0.58, 0.84, 0.90], wall, stripes)
+    })
+}
+
+/// Paints a poster with a white margin into the rectangle left, top, right, bottom.
+fn poster(x: f64, y: f64, rectangle: [f64; 4], wall: Color, picture: impl Fn(f64, f64) -> Color) -> Color {
+    const MARGIN: f64 = 0.05;
+    let [left, top, right, bottom] = rectangle;
+    let (u, v) = ((x - left) / (right - left), (y - top) / (bottom - top));
+    let inside = |lower: f64, upper: f64| u > lower && u < upper && v > lower && v < upper;
+    if inside(MARGIN, 1.0 - MARGIN) {
+        picture((u - MARGIN) / (1.0 - 2.0 * MARGIN), (v - MARGIN) / (1.0 - 2.0 * MARGIN))
+    } else if inside(0.0, 1.0) {
+        [0.93, 0.92, 0.88]
+    } else {
+        // The wall is darker under the paper's lower right edge.
+        let shadow = step(-0.06, 0.0, u) * step(1.06, 1.0, u) * step(-0.04, 0.0, v) * step(1.06, 1.0, v);
+        scale(wall, 1.0 - 0.35 * shadow)
+    }
+}
+
+fn sunrise(u: f64, v: f64) -> Color {
+    let (dx, dy) = (u - 0.5, v - 0.42);
+    let distance = dx.hypot(dy);
+    let ray = ((dy.atan2(dx) * 16.0 / std::f64::consts::TAU).rem_euclid(1.0) - 0.5).abs();
+    let sky = mix([0.98, 0.78, 0.30], [0.90, 0.33, 0.20], step(0.22, 0.28, ray));
+    let color = mix([0.99, 0.95, 0.80], sky, step(0.16, 0.17, distance));
+    let hill = 0.70 + 0.07 * (u * 9.0).sin() + 0.03 * (u * 23.0).cos();
+    let front = 0.83 + 0.05 * (u * 6.0 + 2.0).sin();
+    let color = if v > hill { [0.16, 0.38, 0.42] } else { color };
+    if v > front { [0.07, 0.16, 0.24] } else { color }
+}
+
+fn squares(u: f64, v: f64) -> Color {
+    const COLORS: [Color; 6] = [
+        [0.85, 0.15, 0.15],
+        [0.10, 0.30, 0.70],
+        [0.95, 0.80, 0.15],
+        [0.12, 0.12, 0.12],
+        [0.95, 0.95, 0.92],
+        [0.10, 0.55, 0.35],
+    ];
+    let (column, row) = ((u * 8.0).floor(), (v * 6.0).floor());
+    let random = Random::new(0x7e37, &[21]);
+    let pick = |counter: u64| COLORS[(random.bits(counter) % 6) as usize];
+    let cell = (row * 8.0 + column) as u64;
+    let from_center = ((u * 8.0).fract() - 0.5).hypot((v * 6.0).fract() - 0.5);
+    if from_center < 0.36 { pick(cell + 100) } else { pick(cell) }
+}
+
+fn map(noise: &Noise, u: f64, v: f64) -> Color {
+    let height = noise.rough(u * 3.0 + 40.0, v * 3.0, 5);
+    let contour = ((height * 24.0).fract() - 0.5).abs();
+    let land = mix([0.55, 0.72, 0.40], [0.80, 0.66, 0.42], step(0.5, 0.7, height));
+    let color = if height < 0.46 { mix([0.16, 0.38, 0.62], [0.45, 0.68, 0.84], step(0.3, 0.46, height)) } else { land };
+    let color = scale(color, 0.55 + 0.45 * step(0.0, 0.12, contour));
+    let grid = ((u * 6.0).fract() - 0.5).abs().max(((v * 5.0).fract() - 0.5).abs());
+    if grid > 0.485 { [0.15, 0.15, 0.20] } else { color }
+}
+
+fn stripes(u: f64, v: f64) -> Color {
+    let wave = v * 9.0 + 0.5 * (u * 11.0).sin() + 0.2 * (u * 27.0).cos();
+    let colors: [Color; 4] = [[0.12, 0.14, 0.30], [0.92, 0.88, 0.78], [0.80, 0.25, 0.30], [0.25, 0.55, 0.62]];
+    let color = colors[wave.floor().rem_euclid(4.0) as usize];
+    scale(color, 0.82 + 0.18 * (wave.fract() * 3.0).fract())
+}
+
+/// A brushed metal table with threaded holes every 25 mm, when one texture covers 0.8 m.
+pub(crate) fn metal_table() -> Texture {
+    const N_HOLES: f64 = 32.0;
+    let (brush, blotch, scratch) = (Noise::new(31), Noise::new(32), Noise::new(33));
+    Texture::paint(SIDE_PX, |x, y| {
+        let brushed = 0.6 * brush.at(x * 9.0, y * 480.0) + 0.4 * brush.rough(x * 40.0, y * 260.0, 3);
+        let worn = blotch.rough(x * 6.0, y * 6.0, 5);
+        let metal = scale(mix([0.40, 0.43, 0.47], [0.66, 0.66, 0.64], step(0.25, 0.75, worn)), 0.78 + 0.4 * brushed);
+        let line = (scratch.at(x * 12.0 + y * 3.0, y * 14.0 - x * 9.0) - 0.5).abs();
+        let metal = mix([0.86, 0.87, 0.88], metal, step(0.001, 0.008, line));
+        let from_hole = ((x * N_HOLES).fract() - 0.5).hypot((y * N_HOLES).fract() - 0.5);
+        let rim = mix([0.82, 0.83, 0.84], metal, step(0.17, 0.22, from_hole));
+        mix([0.06, 0.06, 0.07], rim, step(0.125, 0.155, from_hole))
+    })
+}
+
+/// Sawn wood: grain in the upper three quarters, end grain with rings in the lowest quarter.
+pub(crate) fn wood() -> Texture {
+    let (bend, fiber) = (Noise::new(41), Noise::new(42));
+    const DARK: Color = [0.42, 0.24, 0.11];
+    const LIGHT: Color = [0.83, 0.62, 0.38];
+    Texture::paint(SIDE_PX, |x, y| {
+        let fine = fiber.rough(x * 14.0, y * 260.0, 3);
+        if y < END_GRAIN_TOP {
+            let knot = (-((x - 0.62) / 0.10).powi(2) - ((y - 0.3) / 0.05).powi(2)).exp();
+            let ring = y * 26.0 + 3.2 * bend.rough(x * 2.2, y * 5.0, 3) + 2.5 * knot;
+            let grain = (ring.fract() * 1.25).min(1.0 - (ring.fract() - 0.8).max(0.0) * 5.0);
+            let color = mix(LIGHT, DARK, 0.75 * grain * grain + 0.25 * (1.0 - fine));
+            return mix(color, [0.22, 0.12, 0.06], 0.8 * step(0.5, 0.95, knot));
+        }
+        let (u, v) = (x - 0.35, (y - END_GRAIN_TOP) / (1.0 - END_GRAIN_TOP) - 1.4);
+        let radius = u.hypot(v) * 24.0 + 1.4 * bend.rough(x * 4.0, y * 16.0, 3);
+        let speckle = fiber.rough(x * 150.0, y * 150.0, 2);
+        mix(scale(LIGHT, 0.9), DARK, 0.8 * radius.fract().powi(2) + 0.3 * speckle)
+    })
+}
+
+/// Where the end grain begins in the wood texture.
+pub(crate) const END_GRAIN_TOP: f64 = 0.75;
+
+/// Fur colours. Left to right: single hairs; top to bottom of a band: tip to root. Bands: [`FurBand`].
+pub(crate) fn fur() -> Texture {
+    let (hair, skin) = (Noise::new(51), Noise::new(52));
+    Texture::paint(SIDE_PX, |x, y| {
+        let band = (y * 4.0).floor();
+        let to_root = (y * 4.0).fract();
+        let tone = hair.rough(x * 250.0, band * 7.0, 2);
+        let (tip, root): (Color, Color) = match band as i64 {
+            0 => ([0.74, 0.66, 0.57], [0.27, 0.21, 0.17]),
+            1 => ([0.96, 0.93, 0.87], [0.62, 0.55, 0.47]),
+            2 => ([0.25, 0.17, 0.13], [0.08, 0.06, 0.05]),
+            _ => ([0.90, 0.66, 0.62], [0.70, 0.46, 0.44]),
+        };
+        let color = scale(mix(tip, root, to_root.powf(0.8)), 0.62 + 0.7 * tone);
+        scale(color, 0.92 + 0.16 * skin.rough(x * 30.0, y * 60.0, 3))
+    })
+}
+
+/// Bands of the fur texture from the top.
+#[derive(Clone, Copy)]
+pub(crate) enum FurBand {
+    /// Gray-brown coat.
+    Coat,
+    /// Light muzzle and belly.
+    Light,
+    /// Dark mane, hooves and ear tips.
+    Dark,
+    /// Pink inside of the ears.
+    Pink,
+}
+
+impl FurBand {
+    /// Top and bottom in the texture, a little inside so that mip levels do not mix bands.
+    pub(crate) fn rows(self) -> [f64; 2] {
+        let top = f64::from(self as u8) / 4.0;
+        [top + 0.02, top + 0.23]
+    }
+}
+
+/// Six tags in two rows of three, ids from the left and from the top; the lowest third is white.
+pub(crate) fn tags() -> Texture {
+    let cells: Vec<_> = (0..tag::CODES.len()).map(tag::cells).collect();
+    let paper = Noise::new(61);
+    // Twice the usual size, so that an edge between cells stays sharp close up.
+    Texture::paint(2 * SIDE_PX, |x, y| {
+        let (across, down) = (x * 3.0, y * 3.0);
+        let light = 0.97 + 0.03 * paper.rough(x * 200.0, y * 200.0, 2);
+        let id = down.floor() as usize * 3 + across.floor() as usize;
+        let Some(cells) = cells.get(id) else {
+            return scale([0.93, 0.93, 0.91], light);
+        };
+        let cell = |share: f64| ((share.fract() * tag::N_CELLS as f64) as usize).min(tag::N_CELLS - 1);
+        let white = cells[cell(down)][cell(across)];
+        scale(if white { [0.93, 0.93, 0.91] } else { [0.06, 0.06, 0.07] }, light)
+    })
+}
+
+/// Rectangle of a tag in [`tags`]: left, top, right, bottom.
+pub(crate) fn tag_rectangle(id: usize) -> [f64; 4] {
+    let (column, row) = ((id % 3) as f64, (id / 3) as f64);
+    [column / 3.0, row / 3.0, (column + 1.0) / 3.0, (row + 1.0) / 3.0]
+}
+
+/// A concrete floor.
+pub(crate) fn concrete() -> Texture {
+    let (rough, blotch) = (Noise::new(71), Noise::new(72));
+    Texture::paint(SIDE_PX, |x, y| {
+        let shade = 0.5 + 0.35 * blotch.rough(x * 8.0, y * 8.0, 5) + 0.2 * rough.rough(x * 120.0, y * 120.0, 3);
+        let joint = ((x * 4.0).fract() - 0.5).abs().max(((y * 4.0).fract() - 0.5).abs());
+        scale([0.52, 0.51, 0.49], shade * (1.0 - 0.5 * step(0.49, 0.497, joint)))
+    })
+}

@@ -1,0 +1,214 @@
+//! A furry toy donkey: a body of ellipsoids, and thousands of hairs in one mesh.
+
+use crate::mesh::{Corner, Mesh, ellipsoid_normal, sphere_direction};
+use crate::random::Random;
+use crate::texture::FurBand;
+use nalgebra::{Point3, UnitQuaternion, Vector3};
+
+/// One part of the body: an ellipsoid, covered with hair or not.
+struct Part {
+    center_m: [f64; 3],
+    /// Half sizes along the part's own axes.
+    half_m: [f64; 3],
+    /// Rotation about y, radians: positive tips the part's x axis down.
+    pitch_rad: f64,
+    /// Rotation about x before that, radians.
+    lean_rad: f64,
+    band: FurBand,
+    n_hairs: u64,
+    hair_m: f64,
+}
+
+const fn part(center_m: [f64; 3], half_m: [f64; 3], pitch_rad: f64, lean_rad: f64, band: FurBand) -> Part {
+    Part { center_m, half_m, pitch_rad, lean_rad, band, n_hairs: 0, hair_m: 0.0 }
+}
+
+impl Part {
+    const fn hairy(self, n_hairs: u64, hair_m: f64) -> Self {
+        Self { n_hairs, hair_m, ..self }
+    }
+
+    fn half_axes(&self) -> [Vector3<f64>; 3] {
+        let turn = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), self.pitch_rad)
+            * UnitQuaternion::from_axis_angle(&Vector3::x_axis(), self.lean_rad);
+        [
+            turn * Vector3::new(self.half_m[0], 0.0, 0.0),
+            turn * Vector3::new(0.0, self.half_m[1], 0.0),
+            turn * Vector3::new(0.0, 0.0, self.half_m[2]),
+        ]
+    }
+
+    fn center(&self) -> Point3<f64> {
+        Point3::from(self.center_m)
+    }
+}
+
+/// The toy stands on z = 0, looks along x, and is 0.15 m high.
+const PARTS: [Part; 22] = [
+    // Trunk, chest and belly.
+    part([0.0, 0.0, 0.062], [0.048, 0.027, 0.027], 0.0, 0.0, FurBand::Coat).hairy(900, 0.010),
+    part([0.034, 0.0, 0.068], [0.024, 0.024, 0.027], -0.3, 0.0, FurBand::Coat).hairy(300, 0.010),
+    part([0.0, 0.0, 0.052], [0.038, 0.021, 0.020], 0.0, 0.0, FurBand::Light).hairy(160, 0.009),
+    // Neck, head, muzzle.
+    part([0.052, 0.0, 0.092], [0.028, 0.016, 0.019], -0.95, 0.0, FurBand::Coat).hairy(350, 0.008),
+    part([0.070, 0.0, 0.113], [0.026, 0.018, 0.020], 0.35, 0.0, FurBand::Coat).hairy(400, 0.006),
+    part([0.090, 0.0, 0.104], [0.016, 0.014, 0.014], 0.35, 0.0, FurBand::Light).hairy(160, 0.003),
+    // Nostrils and eyes.
+    part([0.1045, 0.006, 0.103], [0.002, 0.002, 0.0028], 0.35, 0.0, FurBand::Dark),
+    part([0.1045, -0.006, 0.103], [0.002, 0.002, 0.0028], 0.35, 0.0, FurBand::Dark),
+    part([0.079, 0.0165, 0.119], [0.0042, 0.0030, 0.0048], 0.3, 0.0, FurBand::Dark),
+    part([0.079, -0.0165, 0.119], [0.0042, 0.0030, 0.0048], 0.3, 0.0, FurBand::Dark),
+    // Ears and their insides.
+    part([0.060, 0.014, 0.143], [0.006, 0.009, 0.024], -0.25, -0.30, FurBand::Coat).hairy(180, 0.005),
+    part([0.060, -0.014, 0.143], [0.006, 0.009, 0.024], -0.25, 0.30, FurBand::Coat).hairy(180, 0.005),
+    part([0.0635, 0.014, 0.143], [0.005, 0.0062, 0.019], -0.25, -0.30, FurBand::Pink),
+    part([0.0635, -0.014, 0.143], [0.005, 0.0062, 0.019], -0.25, 0.30, FurBand::Pink),
+    // Legs, then hooves.
+    part([0.034, 0.016, 0.028], [0.011, 0.010, 0.026], 0.0, 0.0, FurBand::Coat).hairy(130, 0.006),
+    part([0.034, -0.016, 0.028], [0.011, 0.010, 0.026], 0.0, 0.0, FurBand::Coat).hairy(130, 0.006),
+    part([-0.034, 0.016, 0.028], [0.012, 0.011, 0.026], 0.1, 0.0, FurBand::Coat).hairy(130, 0.006),
+    part([-0.034, -0.016, 0.028], [0.012, 0.011, 0.026], 0.1, 0.0, FurBand::Coat).hairy(130, 0.006),
+    part([0.035, 0.016, 0.006], [0.012, 0.011, 0.006], 0.0, 0.0, FurBand::Dark),
+    part([0.035, -0.016, 0.006], [0.012, 0.011, 0.006], 0.0, 0.0, FurBand::Dark),
+    part([-0.037, 0.016, 0.006], [0.012, 0.011, 0.006], 0.0, 0.0, FurBand::Dark),
+    part([-0.037, -0.016, 0.006], [0.012, 0.011, 0.006], 0.0, 0.0, FurBand::Dark),
+];
+
+/// The smooth body under the fur.
+pub(crate) fn body() -> Mesh {
+    let mut mesh = Mesh::default();
+    for part in &PARTS {
+        let [tip, root] = part.band.rows();
+        // Skin has the colour of the roots where hair grows, else the whole band's.
+        let top = if part.n_hairs > 0 { 0.5 * (tip + root) } else { tip };
+        mesh.add_ellipsoid(part.center(), part.half_axes(), 10, [0.0, top, 1.0, root]);
+    }
+    mesh
+}
+
+/// All hairs: coat, mane, forelock and tail.
+pub(crate) fn fur() -> Mesh {
+    let mut mesh = Mesh::default();
+    for (ix, part) in PARTS.iter().enumerate() {
+        let random = Random::new(0xf0_44, &[ix as u64]);
+        let half_axes = part.half_axes();
+        for hair in 0..part.n_hairs {
+            let direction = sphere_direction(
+                random.unit(8 * hair).mul_add(-2.0, 1.0).acos() / std::f64::consts::PI,
+                random.unit(8 * hair + 1),
+            );
+            let root =
+                part.center() + half_axes[0] * direction.x + half_axes[1] * direction.y + half_axes[2] * direction.z;
+            if is_inside_another(&root, ix) {
+                continue;
+            }
+            let length_m = part.hair_m * random.between(8 * hair + 2, 0.6, 1.25);
+            grow(
+                &mut mesh,
+                random,
+                8 * hair + 3,
+                &Hair {
+                    root,
+                    normal: ellipsoid_normal(&half_axes, &direction),
+                    length_m,
+                    width_m: 0.0011,
+                    band: part.band,
+                },
+            );
+        }
+    }
+    add_mane(&mut mesh);
+    add_tail(&mut mesh);
+    mesh
+}
+
+fn is_inside_another(point: &Point3<f64>, own_ix: usize) -> bool {
+    PARTS.iter().enumerate().any(|(ix, part)| {
+        let offset = point - part.center();
+        let share: f64 = part.half_axes().iter().map(|axis| (axis.dot(&offset) / axis.norm_squared()).powi(2)).sum();
+        ix != own_ix && share < 0.9
+    })
+}
+
+struct Hair {
+    root: Point3<f64>,
+    normal: Vector3<f64>,
+    length_m: f64,
+    width_m: f64,
+    band: FurBand,
+}
+
+/// Adds a tapered hair of two pieces that leans back and droops; it uses five counters.
+fn grow(mesh: &mut Mesh, random: Random, counter: u64, hair: &Hair) {
+    let jitter = Vector3::new(
+        random.between(counter, -0.45, 0.45),
+        random.between(counter + 1, -0.45, 0.45),
+        random.between(counter + 2, -0.45, 0.45),
+    );
+    let combed = Vector3::new(-0.55, 0.0, -0.25);
+    let start = (hair.normal + combed * 0.6 + jitter).normalize();
+    let end = (start + combed * 0.7 + Vector3::new(0.0, 0.0, -0.35)).normalize();
+    let middle = hair.root + start * (0.55 * hair.length_m);
+    let tip = middle + end * (0.45 * hair.length_m);
+    let side = start.cross(&Vector3::new(0.3, 0.2, 0.9)).normalize();
+    let across = start.cross(&side);
+    let tone = random.unit(counter + 3);
+    let [band_tip, band_root] = hair.band.rows();
+    let corners = [0.0, 1.0, 2.0].map(|third: f64| {
+        let (sin, cos) = (third / 3.0 * std::f64::consts::TAU).sin_cos();
+        side * cos + across * sin
+    });
+    let row = |share: f64| band_root + (band_tip - band_root) * share;
+    // The skin's normal is blended in, so that a coat is shaded as a whole.
+    let shade = |outward: &Vector3<f64>| (outward * 0.5 + hair.normal).normalize();
+    let mut ring = |center: Point3<f64>, radius: f64, share: f64| {
+        corners.map(|outward| {
+            mesh.push(Corner {
+                point_m: center + outward * radius,
+                normal: shade(&outward),
+                texcoord: [tone, row(share)],
+            })
+        })
+    };
+    let below = ring(hair.root, 0.5 * hair.width_m, 0.0);
+    let above = ring(middle, 0.36 * hair.width_m, 0.6);
+    let top = mesh.push(Corner { point_m: tip, normal: shade(&end), texcoord: [tone, row(1.0)] });
+    for ix in 0..3 {
+        let next = (ix + 1) % 3;
+        mesh.triangle([below[ix], below[next], above[next]]);
+        mesh.triangle([below[ix], above[next], above[ix]]);
+        mesh.triangle([above[ix], above[next], top]);
+    }
+}
+
+fn add_mane(mesh: &mut Mesh) {
+    let random = Random::new(0xf0_44, &[100]);
+    let line = [
+        Point3::new(0.020, 0.0, 0.093),
+        Point3::new(0.036, 0.0, 0.110),
+        Point3::new(0.052, 0.0, 0.132),
+        Point3::new(0.078, 0.0, 0.132),
+    ];
+    for hair in 0..420 {
+        let piece = usize::try_from(random.bits(9 * hair) % 3).expect("below 3");
+        let along = random.unit(9 * hair + 8);
+        let root = line[piece] + (line[piece + 1] - line[piece]) * along;
+        let aside = random.between(9 * hair + 1, -0.005, 0.005);
+        let normal = Vector3::new(-0.35, 60.0 * aside, 0.9).normalize();
+        let length_m = random.between(9 * hair + 2, 0.012, 0.022);
+        let root = root + Vector3::new(0.0, aside, -0.004);
+        grow(mesh, random, 9 * hair + 3, &Hair { root, normal, length_m, width_m: 0.0013, band: FurBand::Dark });
+    }
+}
+
+fn add_tail(mesh: &mut Mesh) {
+    let random = Random::new(0xf0_44, &[101]);
+    for hair in 0..160 {
+        let along = random.unit(9 * hair);
+        let root =
+            Point3::new(-0.046 - 0.020 * along, random.between(9 * hair + 1, -0.003, 0.003), 0.075 - 0.030 * along);
+        let normal = Vector3::new(-0.5, 0.0, -0.8).normalize();
+        let length_m = 0.012 + 0.016 * along;
+        grow(mesh, random, 9 * hair + 3, &Hair { root, normal, length_m, width_m: 0.0013, band: FurBand::Dark });
+    }
+}
