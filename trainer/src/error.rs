@@ -9,6 +9,43 @@ pub enum Error {
     /// No GPU, real or software, answers.
     #[error("no GPU adapter found: install a Vulkan driver (software: the package mesa-vulkan-drivers)")]
     NoAdapter,
+    /// The adapter is there but refuses a device.
+    #[error("GPU {adapter:?} refuses a device")]
+    NoDevice {
+        /// Name of the adapter.
+        adapter: String,
+        /// Why.
+        source: wgpu::RequestDeviceError,
+    },
+    /// The GPU stopped answering.
+    #[error("the GPU stopped answering: its driver reset or lost the device")]
+    DeviceLost,
+    /// A buffer past the adapter's limit.
+    #[error("buffer {label}: {bytes} bytes are more than this GPU can bind ({limit_bytes} bytes); lower --max-splats or the image size")]
+    BufferTooLarge {
+        /// Name of the buffer.
+        label: String,
+        /// Bytes wanted.
+        bytes: u64,
+        /// Bytes allowed.
+        limit_bytes: u64,
+    },
+    /// A kernel imports what is not there.
+    #[error("kernel {kernel}: unknown import {import:?}")]
+    UnknownImport {
+        /// Name of the kernel.
+        kernel: &'static str,
+        /// The import.
+        import: String,
+    },
+    /// A kernel does not parse or validate.
+    #[error("kernel {kernel}: {message}")]
+    Wgsl {
+        /// Name of the kernel.
+        kernel: &'static str,
+        /// What naga says.
+        message: String,
+    },
     /// A picture does not hold four bytes a pixel.
     #[error("{what} picture of {width}x{height} pixels: got {got} bytes, expected {expected}")]
     PictureBytes {

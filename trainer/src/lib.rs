@@ -2,6 +2,7 @@
 
 mod error;
 pub mod eval;
+pub mod gpu;
 pub mod keyframe;
 pub mod loss;
 pub mod method;
@@ -10,9 +11,10 @@ mod mismatches;
 pub mod optim;
 pub mod ply;
 pub mod request;
+pub mod sort;
 pub mod splat;
 
 pub use error::Error;
 pub use keyframe::{DepthMap, Keyframe, Split, Truth};
 pub use method::{Method, Progress};
-pub use request::{Aabb, Picture, Projection, RenderRequest};
+pub use request::{Aabb, Picture, Projection, RenderRequest, Shutter};

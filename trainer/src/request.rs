@@ -1,6 +1,6 @@
 //! Requests for pictures of the model, and the pictures.
 
-use kinematics::Transform;
+use kinematics::{Transform, Twist};
 
 /// A box with sides along the axes of the frame it is given in, metres.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -27,6 +27,15 @@ pub enum Projection {
     Equirectangular,
 }
 
+/// Motion of a camera whose rows are exposed one after the other.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Shutter {
+    /// Velocity of the camera in its own axes.
+    pub twist: Twist,
+    /// Time from the first row's exposure to the last row's, seconds.
+    pub readout_secs: f64,
+}
+
 /// What to draw.
 #[derive(Clone, Debug)]
 pub struct RenderRequest {
@@ -36,6 +45,8 @@ pub struct RenderRequest {
     pub size_px: [u32; 2],
     /// How directions map to pixels.
     pub projection: Projection,
+    /// Rolling shutter to imitate, as when a render is compared with a real image; `None` for people.
+    pub shutter: Option<Shutter>,
     /// Nothing nearer than this along z is drawn, metres.
     pub near_m: f64,
     /// Nothing further than this is drawn, metres.

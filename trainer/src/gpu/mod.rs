@@ -1,0 +1,15 @@
+//! The GPU as this crate sees it: one device, pipelines found by reflection, lists of passes. No word about splats.
+
+mod device;
+mod passes;
+mod pipeline;
+mod pod;
+mod requirements;
+mod wgsl;
+
+pub use device::{Buffer, Gpu, GpuOptions};
+pub use passes::{PassTiming, Passes};
+pub use pipeline::{Kernel, Pipeline};
+pub use pod::{f32_of, f32s_of};
+pub use requirements::Optional;
+pub use wgsl::{Source, reflect, resolve};

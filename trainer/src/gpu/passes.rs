@@ -1,0 +1,183 @@
+//! Lists of passes, and the only code that encodes them.
+
+use super::{Buffer, Gpu, Pipeline};
+use crate::Error;
+use std::collections::HashMap;
+
+/// Most workgroups WebGPU allows along one axis.
+const MAX_GROUPS_PER_AXIS: u64 = 65_535;
+
+/// GPU time of one pass.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PassTiming {
+    /// Name of the kernel.
+    pub name: &'static str,
+    /// Milliseconds.
+    pub millis: f64,
+}
+
+enum Pass {
+    Dispatch { pipeline: wgpu::ComputePipeline, bind_group: wgpu::BindGroup, groups: [u32; 2], name: &'static str },
+    Clear { buffer: wgpu::Buffer },
+}
+
+/// A list of GPU passes; listing them does not touch the GPU.
+///
+/// Bind groups are kept between lists, keyed by kernel and buffers; [`Passes::forget_bindings`] lets go of them.
+pub struct Passes {
+    list: Vec<Pass>,
+    bind_groups: HashMap<(u64, Vec<u64>), wgpu::BindGroup>,
+}
+
+impl Default for Passes {
+    fn default() -> Self {
+        Self { list: Vec::new(), bind_groups: HashMap::new() }
+    }
+}
+
+impl std::fmt::Debug for Passes {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_list()
+            .entries(self.list.iter().map(|pass| match pass {
+                Pass::Dispatch { name, groups, .. } => format!("{name} {}x{}", groups[0], groups[1]),
+                Pass::Clear { .. } => "clear".to_owned(),
+            }))
+            .finish()
+    }
+}
+
+impl Passes {
+    /// Adds a kernel over `n_groups` workgroups, folded to two axes; buffers are bound by the names in the WGSL.
+    ///
+    /// # Panics
+    /// When the names differ from those of the kernel: a mistake in this crate, shown with both lists.
+    pub fn dispatch(&mut self, gpu: &Gpu, pipeline: &Pipeline, n_groups: u64, buffers: &[(&str, &Buffer)]) {
+        if n_groups == 0 {
+            return;
+        }
+        let rows = n_groups.div_ceil(MAX_GROUPS_PER_AXIS);
+        let columns = n_groups.div_ceil(rows);
+        assert!(rows <= MAX_GROUPS_PER_AXIS, "{}: {n_groups} workgroups are more than a dispatch holds", pipeline.name);
+        let find = |name: &str| buffers.iter().find(|(given, _)| *given == name).map(|(_, buffer)| *buffer);
+        let found: Option<Vec<&Buffer>> = pipeline.bindings.iter().map(|binding| find(&binding.name)).collect();
+        let Some(found) = found.filter(|found| found.len() == buffers.len()) else {
+            let wanted: Vec<_> = pipeline.bindings.iter().map(|binding| binding.name.as_str()).collect();
+            let given: Vec<_> = buffers.iter().map(|(name, _)| *name).collect();
+            panic!("kernel {} binds {wanted:?}, given {given:?}", pipeline.name);
+        };
+        let key = (pipeline.id, found.iter().map(|buffer| buffer.id).collect());
+        let bind_group = self.bind_groups.entry(key).or_insert_with(|| {
+            let entries: Vec<_> = pipeline
+                .bindings
+                .iter()
+                .zip(&found)
+                .map(|(binding, buffer)| wgpu::BindGroupEntry { binding: binding.number, resource: buffer.raw.as_entire_binding() })
+                .collect();
+            gpu.device.create_bind_group(&wgpu::BindGroupDescriptor { label: Some(pipeline.name), layout: &pipeline.layout, entries: &entries })
+        });
+        self.list.push(Pass::Dispatch {
+            pipeline: pipeline.raw.clone(),
+            bind_group: bind_group.clone(),
+            groups: [u32_of(columns), u32_of(rows)],
+            name: pipeline.name,
+        });
+    }
+
+    /// Adds the zeroing of a buffer.
+    pub fn clear(&mut self, buffer: &Buffer) {
+        self.list.push(Pass::Clear { buffer: buffer.raw.clone() });
+    }
+
+    /// Number of passes listed.
+    pub fn len(&self) -> usize {
+        self.list.len()
+    }
+
+    /// Whether nothing is listed.
+    pub fn is_empty(&self) -> bool {
+        self.list.is_empty()
+    }
+
+    /// Lets go of kept bind groups, and so of buffers that nobody else holds.
+    pub fn forget_bindings(&mut self) {
+        self.bind_groups.clear();
+    }
+
+    /// Sends the list to the GPU and empties it.
+    pub fn submit(&mut self, gpu: &Gpu) {
+        let mut encoder = gpu.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        let mut passes = self.list.drain(..).peekable();
+        while let Some(pass) = passes.next() {
+            match pass {
+                Pass::Clear { buffer } => encoder.clear_buffer(&buffer, 0, None),
+                first @ Pass::Dispatch { .. } => {
+                    let mut compute = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
+                    encode(&mut compute, &first);
+                    while let Some(next) = passes.next_if(|pass| matches!(pass, Pass::Dispatch { .. })) {
+                        encode(&mut compute, &next);
+                    }
+                }
+            }
+        }
+        gpu.queue.submit([encoder.finish()]);
+    }
+
+    /// Sends the list, one timestamped pass a kernel, waits, and tells the GPU time of each.
+    ///
+    /// Empty when the adapter has no timestamps.
+    pub fn submit_timed(&mut self, gpu: &Gpu) -> Result<Vec<PassTiming>, Error> {
+        if !gpu.optional.timestamps {
+            self.submit(gpu);
+            gpu.wait()?;
+            return Ok(Vec::new());
+        }
+        let n = u32_of(self.list.len() as u64);
+        let queries = gpu.device.create_query_set(&wgpu::QuerySetDescriptor { label: Some("timing"), ty: wgpu::QueryType::Timestamp, count: 2 * n.max(1) });
+        let stamps = gpu.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("timing"),
+            size: 16 * u64::from(n.max(1)),
+            usage: wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC,
+            mapped_at_creation: false,
+        });
+        let copy = gpu.storage("timing.copy", 16 * u64::from(n.max(1)))?;
+        let mut encoder = gpu.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        let mut names = Vec::new();
+        for pass in self.list.drain(..) {
+            match &pass {
+                Pass::Clear { buffer } => encoder.clear_buffer(buffer, 0, None),
+                Pass::Dispatch { name, .. } => {
+                    let ix = u32_of(names.len() as u64);
+                    let mut compute = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
+                        label: Some(name),
+                        timestamp_writes: Some(wgpu::ComputePassTimestampWrites {
+                            query_set: &queries,
+                            beginning_of_pass_write_index: Some(2 * ix),
+                            end_of_pass_write_index: Some(2 * ix + 1),
+                        }),
+                    });
+                    encode(&mut compute, &pass);
+                    names.push(*name);
+                }
+            }
+        }
+        let n_stamps = 2 * names.len();
+        encoder.resolve_query_set(&queries, 0..u32_of(n_stamps as u64), &stamps, 0);
+        encoder.copy_buffer_to_buffer(&stamps, 0, &copy.raw, 0, 8 * n_stamps as u64);
+        gpu.queue.submit([encoder.finish()]);
+        let ticks: Vec<u64> = gpu.read(&copy, n_stamps)?;
+        let nanos_per_tick = f64::from(gpu.queue.get_timestamp_period());
+        let millis = |span: &[u64]| span[1].saturating_sub(span[0]) as f64 * nanos_per_tick / 1e6;
+        Ok(names.into_iter().zip(ticks.chunks_exact(2)).map(|(name, span)| PassTiming { name, millis: millis(span) }).collect())
+    }
+}
+
+fn encode(compute: &mut wgpu::ComputePass<'_>, pass: &Pass) {
+    let Pass::Dispatch { pipeline, bind_group, groups, .. } = pass else { return };
+    compute.set_pipeline(pipeline);
+    compute.set_bind_group(0, bind_group, &[]);
+    compute.dispatch_workgroups(groups[0], groups[1], 1);
+}
+
+fn u32_of(value: u64) -> u32 {
+    u32::try_from(value).expect("workgroup counts are folded below 2^16 an axis")
+}

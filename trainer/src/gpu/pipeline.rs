@@ -1,0 +1,68 @@
+//! Compute pipelines whose bindings are found by the names in the WGSL.
+
+use super::wgsl::{Access, Binding};
+use super::{Gpu, Source, reflect, resolve, wgsl};
+use crate::Error;
+
+/// A kernel: its WGSL file and what it may import.
+#[derive(Clone, Copy, Debug)]
+pub struct Kernel {
+    /// The file with the entry point `main`.
+    pub source: Source,
+    /// Files it may import.
+    pub shared: &'static [Source],
+}
+
+/// A compiled kernel.
+#[derive(Debug)]
+pub struct Pipeline {
+    pub(super) id: u64,
+    pub(super) name: &'static str,
+    pub(super) raw: wgpu::ComputePipeline,
+    pub(super) layout: wgpu::BindGroupLayout,
+    pub(super) bindings: Vec<Binding>,
+}
+
+impl Pipeline {
+    /// Compiles `kernel` with the given values of its `override`s.
+    pub fn new(gpu: &Gpu, kernel: Kernel, overrides: &[(&str, f64)]) -> Result<Self, Error> {
+        let name = kernel.source.name;
+        let text = resolve(kernel.source, kernel.shared)?;
+        let module = reflect(name, &text)?;
+        let bindings = wgsl::bindings(&module);
+        let device = &gpu.device;
+        let shader = device.create_shader_module(wgpu::ShaderModuleDescriptor { label: Some(name), source: wgpu::ShaderSource::Wgsl(text.into()) });
+        let entries: Vec<wgpu::BindGroupLayoutEntry> = bindings
+            .iter()
+            .map(|binding| wgpu::BindGroupLayoutEntry {
+                binding: binding.number,
+                visibility: wgpu::ShaderStages::COMPUTE,
+                ty: wgpu::BindingType::Buffer {
+                    ty: match binding.access {
+                        Access::Uniform => wgpu::BufferBindingType::Uniform,
+                        Access::Read => wgpu::BufferBindingType::Storage { read_only: true },
+                        Access::ReadWrite => wgpu::BufferBindingType::Storage { read_only: false },
+                    },
+                    has_dynamic_offset: false,
+                    min_binding_size: None,
+                },
+                count: None,
+            })
+            .collect();
+        let layout = device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: Some(name), entries: &entries });
+        let pipeline_layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+            label: Some(name),
+            bind_group_layouts: &[Some(&layout)],
+            immediate_size: 0,
+        });
+        let raw = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+            label: Some(name),
+            layout: Some(&pipeline_layout),
+            module: &shader,
+            entry_point: Some("main"),
+            compilation_options: wgpu::PipelineCompilationOptions { constants: overrides, zero_initialize_workgroup_memory: false },
+            cache: None,
+        });
+        Ok(Self { id: gpu.fresh_id(), name, raw, layout, bindings })
+    }
+}

@@ -1,0 +1,34 @@
+//! What a kernel may use beyond the WebGPU defaults, and what happens without it.
+
+/// Optional abilities of the adapter; every one has a fallback.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Optional {
+    /// Smallest number of lanes that run together, when subgroup operations may be used: 4 to 128.
+    ///
+    /// Without it sorting ranks sequentially and backward lanes hand their state on through workgroup memory.
+    pub subgroup_lanes: Option<u32>,
+    /// GPU timestamps for per-pass times; without them only wall time is known.
+    pub timestamps: bool,
+}
+
+impl Optional {
+    /// What `adapter` offers; nothing of it when `FIELDRIG_GPU_FEATURES=none` was asked for.
+    pub(super) fn of(adapter: &wgpu::Adapter, allowed: bool) -> Self {
+        let features = adapter.features();
+        let info = adapter.get_info();
+        let same_size = info.subgroup_min_size == info.subgroup_max_size;
+        let subgroups = features.contains(wgpu::Features::SUBGROUP) && same_size && info.subgroup_min_size >= 4;
+        Self {
+            subgroup_lanes: (allowed && subgroups).then_some(info.subgroup_min_size),
+            timestamps: allowed && features.contains(wgpu::Features::TIMESTAMP_QUERY),
+        }
+    }
+
+    /// The wgpu features to ask for.
+    pub(super) fn features(self) -> wgpu::Features {
+        let mut features = wgpu::Features::empty();
+        features.set(wgpu::Features::SUBGROUP, self.subgroup_lanes.is_some());
+        features.set(wgpu::Features::TIMESTAMP_QUERY, self.timestamps);
+        features
+    }
+}

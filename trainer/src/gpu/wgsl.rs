@@ -1,0 +1,86 @@
+//! WGSL sources: `#import name` and reflection through naga.
+
+use crate::Error;
+use wgpu::naga;
+
+/// A WGSL file; the name is the file's, without `.wgsl`.
+#[derive(Clone, Copy, Debug)]
+pub struct Source {
+    /// File name without the ending.
+    pub name: &'static str,
+    /// Contents.
+    pub text: &'static str,
+}
+
+/// How a buffer is bound.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Access {
+    Uniform,
+    Read,
+    ReadWrite,
+}
+
+/// One buffer of a kernel, as naga sees it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Binding {
+    pub(super) name: String,
+    pub(super) number: u32,
+    pub(super) access: Access,
+}
+
+/// Replaces each line `#import name` by the shared source of that name, once, recursively.
+pub fn resolve(kernel: Source, shared: &[Source]) -> Result<String, Error> {
+    let mut text = String::new();
+    let mut seen = Vec::new();
+    append(kernel, shared, &mut seen, &mut text)?;
+    Ok(text)
+}
+
+fn append(source: Source, shared: &[Source], seen: &mut Vec<&'static str>, text: &mut String) -> Result<(), Error> {
+    for line in source.text.lines() {
+        let Some(name) = line.strip_prefix("#import ").map(str::trim) else {
+            text.push_str(line);
+            text.push('\n');
+            continue;
+        };
+        let import = shared
+            .iter()
+            .find(|import| import.name == name)
+            .ok_or_else(|| Error::UnknownImport { kernel: source.name, import: name.to_owned() })?;
+        if !seen.contains(&import.name) {
+            seen.push(import.name);
+            append(*import, shared, seen, text)?;
+        }
+    }
+    Ok(())
+}
+
+/// Parses and validates WGSL and lists the buffers of group 0 in order of their numbers.
+pub fn reflect(name: &'static str, text: &str) -> Result<naga::Module, Error> {
+    let refused = |message: String| Error::Wgsl { kernel: name, message };
+    let module = naga::front::wgsl::parse_str(text).map_err(|error| refused(error.emit_to_string(text)))?;
+    naga::valid::Validator::new(naga::valid::ValidationFlags::all(), naga::valid::Capabilities::all())
+        .validate(&module)
+        .map_err(|error| refused(error.emit_to_string(text)))?;
+    Ok(module)
+}
+
+/// The buffers of group 0 in order of their numbers.
+pub(super) fn bindings(module: &naga::Module) -> Vec<Binding> {
+    let mut found: Vec<Binding> = module
+        .global_variables
+        .iter()
+        .filter_map(|(_, variable)| {
+            let access = match variable.space {
+                naga::AddressSpace::Uniform => Access::Uniform,
+                naga::AddressSpace::Storage { access } if access.contains(naga::StorageAccess::STORE) => Access::ReadWrite,
+                naga::AddressSpace::Storage { .. } => Access::Read,
+                _ => return None,
+            };
+            let number = variable.binding.as_ref()?.binding;
+            Some(Binding { name: variable.name.clone()?, number, access })
+        })
+        .collect();
+    found.sort_by_key(|binding| binding.number);
+    found
+}

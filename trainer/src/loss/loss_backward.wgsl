@@ -1,0 +1,101 @@
+// loss_backward: the slope of the loss towards every pixel's color, transmittance and depth.
+//
+// threads   one per pixel, a workgroup per 16 x 16 pixels
+// reads     view, supervision, image, depth [n_pixels] (premultiplied), target_image, target_depth [n_pixels] (metres, 0: none), slopes
+// writes    upstream [n_pixels] (v of rgb; w: v of depth), rest [n_pixels] (see backward.wgsl; y: absolute error), errors [n_tiles]
+// twin      loss/reference.rs
+
+#import view
+#import supervision
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<uniform> supervision: Supervision;
+@group(0) @binding(2) var<storage, read> image: array<vec4f>;
+@group(0) @binding(3) var<storage, read> depth: array<f32>;
+@group(0) @binding(4) var<storage, read> target_image: array<u32>;
+@group(0) @binding(5) var<storage, read> target_depth: array<f32>;
+@group(0) @binding(6) var<storage, read> slopes: array<f32>;
+@group(0) @binding(7) var<storage, read_write> upstream: array<vec4f>;
+@group(0) @binding(8) var<storage, read_write> rest: array<vec2f>;
+@group(0) @binding(9) var<storage, read_write> errors: array<f32>;
+
+override SSIM: bool = true;
+override DEPTH: bool = true;
+var<workgroup> wg_slopes: array<vec4f, 676>;
+var<workgroup> wg_rows: array<vec4f, 416>;
+var<workgroup> wg_errors: array<f32, 256>;
+
+@compute @workgroup_size(256)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let tile = folded(wg, n_wgs);
+    let in_grid = tile < view.n_tiles.x * view.n_tiles.y;
+    let corner = vec2i(vec2u(tile % view.n_tiles.x, tile / view.n_tiles.x) * TILE_PX);
+    let size = vec2i(view.size_px);
+    let n_pixels = view.size_px.x * view.size_px.y;
+    let pixel = vec2u(corner) + vec2u(lane % TILE_PX, lane / TILE_PX);
+    let on_image = in_grid && pixel.x < view.size_px.x && pixel.y < view.size_px.y;
+    let at = min(pixel.y * view.size_px.x + pixel.x, n_pixels - 1u);
+    let packed = target_image[at];
+    let color = image[at];
+    let seen = on_image && packed >= 0x01000000u;
+    let picture = color.rgb + color.w * supervision.background.rgb;
+    let wanted = rgb_of(packed);
+    let per_value = 1.0 / (3.0 * f32(n_pixels));
+    var v_color = (1.0 - supervision.background.w) * per_value * sign(picture - wanted);
+    if SSIM {
+        let gaussian = GAUSSIAN;
+        for (var channel = 0u; channel < 3u; channel++) {
+            let plane = channel * 3u * n_pixels;
+            for (var i = lane; i < SPAN * SPAN; i += 256u) {
+                let near = corner + vec2i(vec2u(i % SPAN, i / SPAN)) - i32(HALO);
+                var slope = vec4f(0.0);
+                if all(near >= vec2i(0)) && all(near < size) {
+                    let source = plane + u32(near.y * size.x + near.x);
+                    slope = vec4f(slopes[source], slopes[source + n_pixels], slopes[source + 2u * n_pixels], 0.0);
+                }
+                wg_slopes[i] = slope;
+            }
+            workgroupBarrier(); // The window's slopes are there.
+            for (var i = lane; i < SPAN * TILE_PX; i += 256u) {
+                let from_ = (i / TILE_PX) * SPAN + i % TILE_PX;
+                var sum = vec4f(0.0);
+                for (var k = 0u; k < WINDOW; k++) { sum += gaussian[k] * wg_slopes[from_ + k]; }
+                wg_rows[i] = sum;
+            }
+            workgroupBarrier(); // The rows are there; the next channel writes them only after its own first barrier.
+            var sum = vec4f(0.0);
+            for (var k = 0u; k < WINDOW; k++) { sum += gaussian[k] * wg_rows[lane + k * TILE_PX]; }
+            v_color[channel] -= supervision.background.w * per_value * (sum.x + 2.0 * picture[channel] * sum.y + wanted[channel] * sum.z);
+        }
+    }
+    var error = 0.0;
+    if seen { error = dot(abs(picture - wanted), vec3f(1.0 / 3.0)); } else { v_color = vec3f(0.0); }
+    var v_transmittance = dot(v_color, supervision.background.rgb);
+    var v_depth = 0.0;
+    let depth_sum = depth[at];
+    if DEPTH && on_image {
+        let wanted_m = target_depth[at];
+        let miss_m = depth_sum - (1.0 - color.w) * wanted_m;
+        if wanted_m > 0.0 && abs(miss_m) < supervision.depth.y {
+            v_depth = supervision.depth.x / f32(n_pixels) * sign(miss_m);
+            v_transmittance += v_depth * wanted_m;
+        }
+    }
+    if on_image {
+        upstream[at] = vec4f(v_color, v_depth);
+        rest[at] = vec2f(dot(color.rgb, v_color) + depth_sum * v_depth + color.w * v_transmittance, error);
+    }
+    wg_errors[lane] = error;
+    workgroupBarrier(); // All errors are there.
+    if lane < 16u {
+        var sum = 0.0;
+        for (var i = 0u; i < 16u; i++) { sum += wg_errors[lane * 16u + i]; }
+        wg_errors[lane * 16u] = sum; // Each lane writes only the first of those it has read.
+    }
+    workgroupBarrier(); // The 16 partial sums are there.
+    if lane == 0u && in_grid {
+        var sum = 0.0;
+        for (var i = 0u; i < 16u; i++) { sum += wg_errors[i * 16u]; }
+        errors[tile] = sum;
+    }
+}

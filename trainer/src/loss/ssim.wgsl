@@ -1,0 +1,82 @@
+// ssim: the structural similarity of picture and keyframe, and its slopes towards the window's statistics.
+//
+// threads   one per pixel, a workgroup per 16 x 16 pixels
+// reads     view, supervision, image [n_pixels] (premultiplied rgb, transmittance), target [n_pixels] (rgba8; a = 0: masked)
+// writes    slopes [3 channels, 3, n_pixels]: of E[x], E[x x], E[x y]
+// twin      loss/reference.rs
+// source    Wang et al. 2004; gaussian 11, sigma 1.5, zeros outside; one pass over shared memory as in Mallick et al. 2024
+
+#import view
+#import supervision
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<uniform> supervision: Supervision;
+@group(0) @binding(2) var<storage, read> image: array<vec4f>;
+@group(0) @binding(3) var<storage, read> target_image: array<u32>;
+@group(0) @binding(4) var<storage, read_write> slopes: array<f32>;
+
+var<workgroup> wg_pair: array<vec2f, 676>;        // picture, keyframe
+var<workgroup> wg_means: array<vec4f, 416>;       // along rows: x, y, x x, y y
+var<workgroup> wg_products: array<f32, 416>;      // along rows: x y
+
+@compute @workgroup_size(256)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let tile = folded(wg, n_wgs);
+    let corner = vec2i(vec2u(tile % view.n_tiles.x, tile / view.n_tiles.x) * TILE_PX);
+    let size = vec2i(view.size_px);
+    let n_pixels = view.size_px.x * view.size_px.y;
+    let gaussian = GAUSSIAN;
+    for (var channel = 0u; channel < 3u; channel++) {
+        for (var i = lane; i < SPAN * SPAN; i += 256u) {
+            let pixel = corner + vec2i(vec2u(i % SPAN, i / SPAN)) - i32(HALO);
+            var pair = vec2f(0.0);
+            if all(pixel >= vec2i(0)) && all(pixel < size) {
+                let at = u32(pixel.y * size.x + pixel.x);
+                let packed = target_image[at];
+                let color = image[at];
+                if packed >= 0x01000000u {
+                    pair = vec2f(color[channel] + color.w * supervision.background[channel], rgb_of(packed)[channel]);
+                }
+            }
+            wg_pair[i] = pair;
+        }
+        workgroupBarrier(); // The window's pixels are there.
+        for (var i = lane; i < SPAN * TILE_PX; i += 256u) {
+            let at = (i / TILE_PX) * SPAN + i % TILE_PX;
+            var means = vec4f(0.0);
+            var product = 0.0;
+            for (var k = 0u; k < WINDOW; k++) {
+                let pair = wg_pair[at + k];
+                means += gaussian[k] * vec4f(pair, pair * pair);
+                product += gaussian[k] * pair.x * pair.y;
+            }
+            wg_means[i] = means;
+            wg_products[i] = product;
+        }
+        workgroupBarrier(); // The rows are there; the next channel writes them only after its own first barrier.
+        let pixel = vec2u(corner) + vec2u(lane % TILE_PX, lane / TILE_PX);
+        if pixel.x < view.size_px.x && pixel.y < view.size_px.y {
+            var m = vec4f(0.0);
+            var product = 0.0;
+            for (var k = 0u; k < WINDOW; k++) {
+                m += gaussian[k] * wg_means[lane + k * TILE_PX];
+                product += gaussian[k] * wg_products[lane + k * TILE_PX];
+            }
+            const C1 = 0.0001;
+            const C2 = 0.0009;
+            let variances = m.zw - m.xy * m.xy;
+            let a1 = 2.0 * m.x * m.y + C1;
+            let a2 = 2.0 * (product - m.x * m.y) + C2;
+            let b1 = m.x * m.x + m.y * m.y + C1;
+            let b2 = variances.x + variances.y + C2;
+            let similarity = a1 * a2 / (b1 * b2);
+            let of_product = 2.0 * a1 / (b1 * b2);
+            let of_square = -similarity / b2;
+            let of_mean = 2.0 * m.y * a2 / (b1 * b2) - similarity * 2.0 * m.x / b1 - of_product * m.y - 2.0 * of_square * m.x;
+            let at = channel * 3u * n_pixels + pixel.y * view.size_px.x + pixel.x;
+            slopes[at] = of_mean;
+            slopes[at + n_pixels] = of_square;
+            slopes[at + 2u * n_pixels] = of_product;
+        }
+    }
+}

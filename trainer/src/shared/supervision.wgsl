@@ -1,0 +1,20 @@
+// supervision: what the picture is compared with and how.
+
+struct Supervision {
+    background: vec4f,     // rgb behind everything; w: share of D-SSIM in the color loss
+    depth: vec4f,          // weight per metre, metres past which a reading is ignored; z, w: unused
+}
+
+const WINDOW = 11u;
+const HALO = 5u;
+const SPAN = 26u;          // 16 + 2 * HALO
+
+// Gaussian of sigma 1.5 over 11 pixels, summing to 1.
+const GAUSSIAN = array<f32, 11>(
+    0.001028380084, 0.007598758135, 0.03600077213, 0.1093606895, 0.2130055377, 0.2660117249,
+    0.2130055377, 0.1093606895, 0.03600077213, 0.007598758135, 0.001028380084,
+);
+
+fn rgb_of(packed: u32) -> vec3f {
+    return unpack4x8unorm(packed).rgb;
+}

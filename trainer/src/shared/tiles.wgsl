@@ -1,0 +1,54 @@
+// tiles: which tiles of 16 x 16 pixels an ellipse can touch, exactly, row by row.
+//
+// source    the extent of an ellipse within a band, as in Speedy-Splat (Hanson et al. 2024, AccuTile); widened by a
+//           hundredth of a pixel so that rounding never loses a pixel.
+
+struct Ellipse {
+    mean_px: vec2f,
+    conic: vec3f,       // A, B, C of A dx^2 + 2 B dx dy + C dy^2
+    reach: f32,         // the ellipse is where that is <= reach = 2 ln(255 opacity)
+}
+
+const TILE_MARGIN_PX = 0.01;
+
+// First and past-the-last row of tiles.
+fn tile_rows(ellipse: Ellipse, n_tiles: vec2u) -> vec2i {
+    let determinant = ellipse.conic.x * ellipse.conic.z - ellipse.conic.y * ellipse.conic.y;
+    let half_height = sqrt(max(ellipse.reach * ellipse.conic.x / determinant, 0.0)) + TILE_MARGIN_PX;
+    let first = ceil(clamp(ellipse.mean_px.y - half_height, -1e6, 1e6) - 0.5);
+    let last = floor(clamp(ellipse.mean_px.y + half_height, -1e6, 1e6) - 0.5);
+    let begin = clamp(i32(floor(first / 16.0)), 0, i32(n_tiles.y));
+    let end = clamp(i32(floor(last / 16.0)) + 1, begin, i32(n_tiles.y));
+    return vec2i(begin, select(begin, end, last >= first));
+}
+
+// First and past-the-last column of tiles within a row of tiles.
+fn tile_columns(ellipse: Ellipse, row: i32, n_tiles: vec2u) -> vec2i {
+    let a = ellipse.conic.x;
+    let b = ellipse.conic.y;
+    let c = ellipse.conic.z;
+    let determinant = a * c - b * b;
+    let top = f32(row) * 16.0 + 0.5 - TILE_MARGIN_PX - ellipse.mean_px.y;
+    let bottom = top + 15.0 + 2.0 * TILE_MARGIN_PX;
+    let half_width = sqrt(max(ellipse.reach * c / determinant, 0.0));
+    let slant = b / c * half_width;
+    let at_right = clamp(-slant, top, bottom);
+    let at_left = clamp(slant, top, bottom);
+    let right = (-b * at_right + sqrt(max(a * ellipse.reach - determinant * at_right * at_right, 0.0))) / a + TILE_MARGIN_PX;
+    let left = (-b * at_left - sqrt(max(a * ellipse.reach - determinant * at_left * at_left, 0.0))) / a - TILE_MARGIN_PX;
+    let first = ceil(clamp(ellipse.mean_px.x + left, -1e6, 1e6) - 0.5);
+    let last = floor(clamp(ellipse.mean_px.x + right, -1e6, 1e6) - 0.5);
+    let begin = clamp(i32(floor(first / 16.0)), 0, i32(n_tiles.x));
+    let end = clamp(i32(floor(last / 16.0)) + 1, begin, i32(n_tiles.x));
+    return vec2i(begin, select(begin, end, last >= first));
+}
+
+fn n_tiles_touched(ellipse: Ellipse, n_tiles: vec2u) -> u32 {
+    let rows = tile_rows(ellipse, n_tiles);
+    var n = 0;
+    for (var row = rows.x; row < rows.y; row++) {
+        let columns = tile_columns(ellipse, row, n_tiles);
+        n += columns.y - columns.x;
+    }
+    return u32(n);
+}

@@ -1,0 +1,103 @@
+// radix_scatter_parallel: move each key and its value to its place; equal digits keep their order.
+//
+// threads   256 per block of 2048 keys; each subgroup owns consecutive keys
+// reads     digit, status, keys [n], values [n], counts (scanned), totals [256]
+// writes    keys_out [n], values_out [n]
+// source    Merrill and Grimshaw 2011; ranking by ballots as in Ashkiani et al. 2016
+
+#import view
+#import digit
+#import scan
+
+@group(0) @binding(0) var<uniform> digit: Digit;
+@group(0) @binding(1) var<storage, read> status: array<u32>;
+@group(0) @binding(2) var<storage, read> keys: array<u32>;
+@group(0) @binding(3) var<storage, read> values: array<u32>;
+@group(0) @binding(4) var<storage, read> counts: array<u32>;
+@group(0) @binding(5) var<storage, read> totals: array<u32>;
+@group(0) @binding(6) var<storage, read_write> keys_out: array<u32>;
+@group(0) @binding(7) var<storage, read_write> values_out: array<u32>;
+
+override VALUES_ARE_PLACES: bool = false; // The first pass of sorting 0, 1, 2, ... by key.
+const ROUNDS = 8u;
+var<workgroup> wg_ranks: array<atomic<u32>, 4096>; // [subgroup, digit]; subgroups have 16 lanes or more
+
+// Lanes of the subgroup whose digit is this lane's.
+fn peers_of(key_digit: u32, valid: bool) -> vec4u {
+    var peers = subgroupBallot(valid);
+    for (var bit = 0u; bit < 8u; bit++) {
+        let mine = (key_digit & (1u << bit)) != 0u;
+        let having = subgroupBallot(mine);
+        peers &= select(~having, having, vec4<bool>(mine));
+    }
+    return peers;
+}
+
+fn n_bits(mask: vec4u) -> u32 {
+    let n = countOneBits(mask);
+    return n.x + n.y + n.z + n.w;
+}
+
+// The lanes below `lane`.
+fn lanes_below(lane: u32) -> vec4u {
+    let first = vec4u(0u, 32u, 64u, 96u);
+    let n = clamp(vec4i(i32(lane)) - vec4i(first), vec4i(0), vec4i(32));
+    return select((vec4u(1u) << vec4u(n)) - vec4u(1u), vec4u(0xffffffffu), n == vec4i(32));
+}
+
+fn lowest_lane(mask: vec4u) -> u32 {
+    if mask.x != 0u { return firstTrailingBit(mask.x); }
+    if mask.y != 0u { return 32u + firstTrailingBit(mask.y); }
+    if mask.z != 0u { return 64u + firstTrailingBit(mask.z); }
+    return 96u + firstTrailingBit(mask.w);
+}
+
+@compute @workgroup_size(256)
+fn main(
+    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32,
+    @builtin(subgroup_invocation_id) sub_lane: u32, @builtin(subgroup_size) sub_size: u32, @builtin(subgroup_id) subgroup: u32,
+) {
+    let n = status[digit.counter];
+    let block = folded(wg, n_wgs);
+    let n_subgroups = 256u / sub_size;
+    for (var i = 0u; i < n_subgroups; i++) { atomicStore(&wg_ranks[i * 256u + lane], 0u); }
+    workgroupBarrier(); // All ranks start at zero.
+
+    var ranks: array<u32, ROUNDS>;
+    var digits: array<u32, ROUNDS>;
+    let first = block * 2048u + subgroup * sub_size * ROUNDS + sub_lane;
+    for (var round = 0u; round < ROUNDS; round++) {
+        let at = first + round * sub_size;
+        let valid = at < n;
+        var key_digit = 0u;
+        if valid { key_digit = digit_of(keys[at]); }
+        let peers = peers_of(key_digit, valid);
+        let leader = lowest_lane(peers);
+        var base = 0u;
+        // The next round's leader waits for this sum through the shuffle, so the rounds count in order.
+        if valid && sub_lane == leader { base = atomicAdd(&wg_ranks[subgroup * 256u + key_digit], n_bits(peers)); }
+        base = subgroupShuffle(base, select(sub_lane, leader, valid));
+        ranks[round] = base + n_bits(peers & lanes_below(sub_lane));
+        digits[round] = key_digit;
+    }
+    workgroupBarrier(); // All subgroups have counted.
+
+    var total = 0u;
+    var offset = exclusive_scan(lane, totals[lane], &total);
+    if block < digit.max_blocks { offset += counts[lane * digit.max_blocks + block]; }
+    for (var i = 0u; i < n_subgroups; i++) {
+        let count = atomicLoad(&wg_ranks[i * 256u + lane]);
+        atomicStore(&wg_ranks[i * 256u + lane], offset);
+        offset += count;
+    }
+    workgroupBarrier(); // Each digit's place per subgroup is known.
+
+    for (var round = 0u; round < ROUNDS; round++) {
+        let at = first + round * sub_size;
+        if at < n {
+            let place = atomicLoad(&wg_ranks[subgroup * 256u + digits[round]]) + ranks[round];
+            keys_out[place] = keys[at];
+            if VALUES_ARE_PLACES { values_out[place] = at; } else { values_out[place] = values[at]; }
+        }
+    }
+}

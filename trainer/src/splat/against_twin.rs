@@ -1,0 +1,261 @@
+//! The kernels against their f64 twin: pictures, gradients, and what hostile input does.
+
+use super::arrays::SplatArrays;
+use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_tiles};
+use super::kernels::{DrawPipelines, LearnPipelines};
+use super::params::{Camera, Rule, Supervision, status};
+use super::passes::{Target, ViewPasses};
+use super::reference::{self, RenderedImage, Splat, Upstream, View, scene};
+use crate::Shutter;
+use crate::gpu::{Buffer, Gpu, GpuOptions, Passes, f32_of};
+use crate::loss::reference as loss_reference;
+use crate::mismatches::Mismatches;
+use kinematics::Twist;
+use nalgebra::Vector3;
+use std::sync::Arc;
+
+/// Colors are near 1 and f32 carries 24 bits; sums of a few dozen terms and `exp` cost a few of them.
+const COLOR_ABS: f64 = 2e-5;
+/// Gradients sum over hundreds of pixels in f32.
+const GRADIENT_REL: f64 = 2e-3;
+/// Where a decision is this close to its threshold, f32 may decide otherwise.
+const MARGIN: f64 = 1e-4;
+
+struct Bench {
+    gpu: Arc<Gpu>,
+    draw: DrawPipelines,
+    learn: LearnPipelines,
+    splats: SplatBuffers,
+    scratch: Scratch,
+    frame: Frame,
+    status: Buffer,
+    view: Buffer,
+    size_px: [u32; 2],
+}
+
+fn arrays_of(splats: &[Splat]) -> SplatArrays {
+    let f = |values: [f64; 3]| values.map(f32_of);
+    SplatArrays {
+        means: splats.iter().map(|splat| f(splat.mean)).collect(),
+        log_scales: splats.iter().map(|splat| f(splat.log_scale)).collect(),
+        rotations_wxyz: splats.iter().map(|splat| splat.rotation_wxyz.map(f32_of)).collect(),
+        opacity_logits: splats.iter().map(|splat| f32_of(splat.opacity_logit)).collect(),
+        sh: splats.iter().flat_map(|splat| (0..16).map(|ix| splat.sh.get(ix).map_or([0.0; 3], |rgb| f(*rgb)))).collect(),
+        sh_degree: 3,
+    }
+}
+
+fn camera_of(view: &View) -> Camera {
+    let twist = Twist { linear_m_s: Vector3::from(view.linear_m), angular_rad_s: Vector3::from(view.angular_rad) };
+    Camera {
+        world_from_camera: view.camera_from_world.inverse(),
+        size_px: view.size_px,
+        focal_px: view.focal_px,
+        principal_px: view.principal_px,
+        shutter: Some(Shutter { twist, readout_secs: 1.0 }),
+        near_m: view.near_m,
+        far_m: 1e6,
+        crop: None,
+    }
+}
+
+impl Bench {
+    fn new(options: &GpuOptions, view: &View, arrays: &SplatArrays) -> Self {
+        let gpu = Gpu::open(options).unwrap();
+        let draw = DrawPipelines::new(&gpu).unwrap();
+        let learn = LearnPipelines::new(&gpu).unwrap();
+        let n_splats = u32::try_from(arrays.means.len()).unwrap();
+        let mut splats = SplatBuffers::new(&gpu, n_splats, 3).unwrap();
+        splats.append(&gpu, arrays);
+        let tiles = n_tiles(view.size_px);
+        let scratch = Scratch::new(&gpu, &draw, ScratchSize { n_splats, n_isect: 1 << 14, n_buckets: 1 << 10, n_tiles: tiles }).unwrap();
+        let frame = Frame::new(&gpu, view.size_px[0] * view.size_px[1], tiles, true).unwrap();
+        let mut counters = [0u32; status::LEN];
+        counters[status::N_SPLATS as usize] = n_splats;
+        let status = gpu.storage_with("status", bytemuck::cast_slice(&counters)).unwrap();
+        let view_buffer = gpu.uniform_with("view", &camera_of(view).view());
+        Self { draw, learn, splats, scratch, frame, status, view: view_buffer, size_px: view.size_px, gpu }
+    }
+
+    fn passes(&self) -> ViewPasses<'_> {
+        ViewPasses {
+            gpu: &self.gpu,
+            splats: &self.splats,
+            scratch: &self.scratch,
+            frame: &self.frame,
+            status: &self.status,
+            view: &self.view,
+            size_px: self.size_px,
+        }
+    }
+
+    fn render(&self) -> (Vec<[f32; 4]>, Vec<f32>) {
+        let mut passes = Passes::default();
+        self.passes().draw(&mut passes, &self.draw, &self.learn.rasterize);
+        passes.submit(&self.gpu);
+        let n = (self.size_px[0] * self.size_px[1]) as usize;
+        (self.gpu.read(&self.frame.image, n).unwrap(), self.gpu.read(&self.frame.depth, n).unwrap())
+    }
+}
+
+/// Both forms: with the adapter's optional features, and without any.
+fn forms() -> [GpuOptions; 2] {
+    [GpuOptions::default(), GpuOptions { optional_features: false, ..GpuOptions::default() }]
+}
+
+fn clear_pixels(view: &View, splats: &[Splat]) -> Vec<bool> {
+    let clear: Vec<bool> = reference::rasterize::threshold_margins(view, splats).iter().map(|margin| *margin > MARGIN).collect();
+    assert!(clear.iter().filter(|clear| **clear).count() * 10 > clear.len() * 9, "the scene hides too much behind thresholds");
+    clear
+}
+
+#[test]
+fn pictures_match_the_twin() {
+    for (view, seed) in [(scene::tilted_view(), 1), (scene::rolling_view(), 2)] {
+        let splats = scene::small_scene(seed, 40);
+        let expected = reference::render(&view, &splats);
+        let clear = clear_pixels(&view, &splats);
+        let bench = Bench::new(&GpuOptions::default(), &view, &arrays_of(&splats));
+        let (image, depth) = bench.render();
+        let mut wrong = Mismatches::default();
+        for pixel in (0..image.len()).filter(|pixel| clear[*pixel]) {
+            for channel in 0..3 {
+                wrong.check(&format!("pixel {pixel} channel {channel}"), image[pixel][channel].into(), expected.rgb[pixel][channel], COLOR_ABS, 0.0);
+            }
+            wrong.check(&format!("transmittance {pixel}"), image[pixel][3].into(), expected.transmittance[pixel], COLOR_ABS, 0.0);
+            wrong.check(&format!("depth {pixel}"), depth[pixel].into(), expected.depth[pixel], 10.0 * COLOR_ABS, 0.0);
+        }
+        wrong.assert_none();
+    }
+}
+
+fn target_of(image: &RenderedImage, size_px: [u32; 2]) -> loss_reference::Target {
+    let n = image.rgb.len();
+    // Far from the picture everywhere, so that no absolute difference changes sign by rounding.
+    let byte = |value: f64| ((value + 0.25).rem_euclid(1.0) * 255.0).round() / 255.0;
+    loss_reference::Target {
+        size_px: size_px.map(|size| size as usize),
+        rgb: image.rgb.iter().map(|rgb| rgb.map(byte)).collect(),
+        seen: (0..n).map(|pixel| pixel % 37 != 0).collect(),
+        depth_m: (0..n).map(|pixel| if pixel % 3 == 0 { 0.0 } else { 1.5 + 0.01 * (pixel % 50) as f64 }).collect(),
+    }
+}
+
+#[test]
+fn gradients_match_the_twin() {
+    for options in forms() {
+        for (view, seed) in [(scene::tilted_view(), 3), (scene::rolling_view(), 4)] {
+            let splats = scene::small_scene(seed, 40);
+            let rendered = reference::render(&view, &splats);
+            let clear = clear_pixels(&view, &splats);
+            let mut target = target_of(&rendered, view.size_px);
+            for (seen, clear) in target.seen.iter_mut().zip(&clear) {
+                *seen &= clear;
+            }
+            for (depth_m, clear) in target.depth_m.iter_mut().zip(&clear) {
+                *depth_m = if *clear { f64::from(f32_of(*depth_m)) } else { 0.0 };
+            }
+            let weights = loss_reference::Weights { dssim_frac: 0.25, depth_per_m: 0.5, depth_clip_m: 50.0, background_rgb: [0.125, 0.25, 0.5] };
+            let (_, upstream) = loss_reference::loss(&rendered, &target, &weights);
+            check_gradients(&options, &view, &splats, &target, &weights, &upstream);
+        }
+    }
+}
+
+fn check_gradients(options: &GpuOptions, view: &View, splats: &[Splat], target: &loss_reference::Target, weights: &loss_reference::Weights, upstream: &Upstream) {
+    let expected = reference::render_backward(view, splats, upstream);
+    let bench = Bench::new(options, view, &arrays_of(splats));
+    let gpu = &bench.gpu;
+    let byte = |value: f64| u32::from(format!("{:.0}", value * 255.0).parse::<u8>().unwrap());
+    let packed: Vec<u32> = target
+        .rgb
+        .iter()
+        .zip(&target.seen)
+        .map(|(rgb, seen)| byte(rgb[0]) | byte(rgb[1]) << 8 | byte(rgb[2]) << 16 | if *seen { 0xff00_0000 } else { 0 })
+        .collect();
+    let depth: Vec<f32> = target.depth_m.iter().map(|depth_m| f32_of(*depth_m)).collect();
+    let image = gpu.storage_with("target", bytemuck::cast_slice(&packed)).unwrap();
+    let depth = gpu.storage_with("target depth", bytemuck::cast_slice(&depth)).unwrap();
+    let supervision = Supervision {
+        background_srgb: weights.background_rgb.map(f32_of),
+        dssim_frac: f32_of(weights.dssim_frac),
+        depth_weight: f32_of(weights.depth_per_m),
+        depth_clip_m: f32_of(weights.depth_clip_m),
+        unused: [0.0; 2],
+    };
+    let supervision = gpu.uniform_with("supervision", &supervision);
+    let rule = gpu.uniform_with("rule", &<Rule as bytemuck::Zeroable>::zeroed());
+    let gradients_only = LearnPipelines::gradients_only(gpu).unwrap();
+    let mut passes = Passes::default();
+    let view_passes = bench.passes();
+    view_passes.draw(&mut passes, &bench.draw, &bench.learn.rasterize);
+    view_passes.compare(&mut passes, &bench.learn, &Target { image: &image, depth: &depth, supervision: &supervision, ssim: true });
+    view_passes.backward(&mut passes, &bench.learn, &bench.draw);
+    view_passes.update(&mut passes, &gradients_only, &rule);
+    passes.submit(gpu);
+    let n = target.rgb.len();
+    let slopes: Vec<[f32; 4]> = gpu.read(&bench.frame.upstream, n).unwrap();
+    let mut wrong = Mismatches::default();
+    let largest = upstream.rgb.iter().flatten().fold(0.0f64, |most, value| most.max(value.abs()));
+    for (pixel, slope) in slopes.iter().enumerate() {
+        for channel in 0..3 {
+            wrong.check(&format!("upstream {pixel} {channel}"), slope[channel].into(), upstream.rgb[pixel][channel], 1e-3 * largest, 1e-3);
+        }
+        wrong.check(&format!("upstream depth {pixel}"), slope[3].into(), upstream.depth[pixel], 1e-9, 1e-5);
+    }
+    wrong.assert_none();
+
+    let got = bench.splats.read(gpu).unwrap();
+    let mut wrong = Mismatches::default();
+    let largest = |of: fn(&Splat) -> Vec<f64>| expected.splats.iter().flat_map(of).fold(1e-12f64, |most, value| most.max(value.abs()));
+    let [mean, scale, rotation, opacity, sh] = [
+        largest(|splat| splat.mean.to_vec()),
+        largest(|splat| splat.log_scale.to_vec()),
+        largest(|splat| splat.rotation_wxyz.to_vec()),
+        largest(|splat| vec![splat.opacity_logit]),
+        largest(|splat| splat.sh.as_flattened().to_vec()),
+    ];
+    for (ix, splat) in expected.splats.iter().enumerate() {
+        for axis in 0..3 {
+            wrong.check(&format!("mean {ix} {axis}"), got.means[ix][axis].into(), splat.mean[axis], GRADIENT_REL * mean, GRADIENT_REL);
+            wrong.check(&format!("log_scale {ix} {axis}"), got.log_scales[ix][axis].into(), splat.log_scale[axis], GRADIENT_REL * scale, GRADIENT_REL);
+        }
+        for part in 0..4 {
+            let (gpu, twin) = (got.rotations_wxyz[ix][part].into(), splat.rotation_wxyz[part]);
+            wrong.check(&format!("rotation {ix} {part}"), gpu, twin, GRADIENT_REL * rotation, GRADIENT_REL);
+        }
+        wrong.check(&format!("opacity {ix}"), got.opacity_logits[ix].into(), splat.opacity_logit, GRADIENT_REL * opacity, GRADIENT_REL);
+        for (coeff, rgb) in splat.sh.iter().enumerate() {
+            for channel in 0..3 {
+                let gpu = got.sh[16 * ix + coeff][channel].into();
+                wrong.check(&format!("sh {ix} {coeff} {channel}"), gpu, rgb[channel], GRADIENT_REL * sh, GRADIENT_REL);
+            }
+        }
+    }
+    wrong.assert_none();
+}
+
+#[test]
+fn hostile_splats_are_not_seen_and_do_no_harm() {
+    let view = scene::tilted_view();
+    let splats = scene::small_scene(5, 30);
+    let mut hostile = splats.clone();
+    let spoil: [fn(&mut Splat); 6] = [
+        |splat| splat.mean[0] = f64::NAN,
+        |splat| splat.mean[2] = f64::INFINITY,
+        |splat| splat.rotation_wxyz = [0.0; 4],
+        |splat| splat.log_scale[1] = f64::NAN,
+        |splat| splat.log_scale = [80.0; 3],
+        |splat| splat.opacity_logit = f64::NAN,
+    ];
+    for spoil in spoil {
+        let mut splat = splats[0].clone();
+        spoil(&mut splat);
+        hostile.push(splat);
+    }
+    let mut on_camera_plane = splats[1].clone();
+    on_camera_plane.mean = view.camera_from_world.inverse().translation.vector.into();
+    hostile.push(on_camera_plane);
+    let (image, depth) = Bench::new(&GpuOptions::default(), &view, &arrays_of(&hostile)).render();
+    assert!(image.as_flattened().iter().chain(&depth).all(|value| value.is_finite()));
+}

@@ -1,0 +1,255 @@
+//! GPU memory of the model, of one view's intersections, and of one picture.
+
+use super::arrays::SplatArrays;
+use super::kernels::DrawPipelines;
+use super::params::{Capacity, Model, TILE_PX, status};
+use crate::Error;
+use crate::gpu::{Buffer, Gpu};
+use crate::sort::SortBuffers;
+
+/// Floats of the spherical harmonics past the constant one.
+pub(crate) fn n_sh_rest(sh_degree: u32) -> u32 {
+    3 * ((sh_degree + 1) * (sh_degree + 1) - 1)
+}
+
+/// The model: parameters and Adam's moments, with room for `capacity` splats.
+#[derive(Debug)]
+pub(crate) struct SplatBuffers {
+    pub(crate) n_splats: u32,
+    pub(crate) capacity: u32,
+    pub(crate) sh_degree: u32,
+    pub(crate) model: Buffer,
+    pub(crate) means: Buffer,
+    pub(crate) rotations: Buffer,
+    pub(crate) shapes: Buffer,
+    pub(crate) sh_dc: Buffer,
+    pub(crate) sh_rest: Buffer,
+    pub(crate) moments: Buffer,
+    pub(crate) sh_dc_moments: Buffer,
+    pub(crate) sh_rest_moments: Buffer,
+    pub(crate) error_sums: Buffer,
+}
+
+impl SplatBuffers {
+    /// Empty, with room for `capacity` splats of `sh_degree`.
+    pub(crate) fn new(gpu: &Gpu, capacity: u32, sh_degree: u32) -> Result<Self, Error> {
+        let capacity = capacity.max(1);
+        let n = u64::from(capacity);
+        let rest = u64::from(n_sh_rest(sh_degree)).max(1);
+        let model = Model { n_splats: 0, capacity, sh_degree, n_sh_rest: n_sh_rest(sh_degree) };
+        Ok(Self {
+            n_splats: 0,
+            capacity,
+            sh_degree,
+            model: gpu.uniform_with("splat.model", &model),
+            means: gpu.storage("splat.means", 16 * n)?,
+            rotations: gpu.storage("splat.rotations", 16 * n)?,
+            shapes: gpu.storage("splat.shapes", 16 * n)?,
+            sh_dc: gpu.storage("splat.sh_dc", 12 * n)?,
+            sh_rest: gpu.storage("splat.sh_rest", 4 * rest * n)?,
+            moments: gpu.storage("splat.moments", 96 * n)?,
+            sh_dc_moments: gpu.storage("splat.sh_dc_moments", 24 * n)?,
+            sh_rest_moments: gpu.storage("splat.sh_rest_moments", 8 * rest * n)?,
+            error_sums: gpu.storage("splat.error_sums", 4 * n)?,
+        })
+    }
+
+    /// Bytes of parameters and moments.
+    pub(crate) fn bytes(&self) -> u64 {
+        self.planes().iter().map(|(buffer, _, _)| buffer.bytes()).sum()
+    }
+
+    /// A copy with more room; the moments come along.
+    pub(crate) fn grown(&self, gpu: &Gpu, capacity: u32) -> Result<Self, Error> {
+        let mut larger = Self::new(gpu, capacity, self.sh_degree)?;
+        let (stride_from, stride_to) = (u64::from(self.capacity), u64::from(larger.capacity));
+        for ((from, n_planes, bytes), (to, _, _)) in self.planes().iter().zip(larger.planes()) {
+            for plane in 0..u64::from(*n_planes) {
+                gpu.copy((from, plane * stride_from * bytes), (to, plane * stride_to * bytes), u64::from(self.n_splats) * bytes);
+            }
+        }
+        larger.set_n(gpu, self.n_splats);
+        Ok(larger)
+    }
+
+    /// Says how many splats there are.
+    pub(crate) fn set_n(&mut self, gpu: &Gpu, n_splats: u32) {
+        self.n_splats = n_splats;
+        let model = Model { n_splats, capacity: self.capacity, sh_degree: self.sh_degree, n_sh_rest: n_sh_rest(self.sh_degree) };
+        gpu.write(&self.model, 0, bytemuck::bytes_of(&model));
+    }
+
+    /// Appends splats; there must be room. Functions past this model's degree are left out, missing ones are zero.
+    pub(crate) fn append(&mut self, gpu: &Gpu, arrays: &SplatArrays) {
+        let first = u64::from(self.n_splats);
+        let n_new = arrays.means.len();
+        let means: Vec<[f32; 4]> = arrays.means.iter().map(|[x, y, z]| [*x, *y, *z, 0.0]).collect();
+        let shape = |(scale, opacity): (&[f32; 3], &f32)| [scale[0], scale[1], scale[2], *opacity];
+        let shapes: Vec<[f32; 4]> = arrays.log_scales.iter().zip(&arrays.opacity_logits).map(shape).collect();
+        gpu.write(&self.means, 16 * first, bytemuck::cast_slice(&means));
+        gpu.write(&self.rotations, 16 * first, bytemuck::cast_slice(&arrays.rotations_wxyz));
+        gpu.write(&self.shapes, 16 * first, bytemuck::cast_slice(&shapes));
+        let n_coeffs = arrays.n_coefficients();
+        let plane = |function: usize, channel: usize| -> Vec<f32> {
+            arrays.sh.chunks_exact(n_coeffs).map(|coeffs| coeffs.get(function).map_or(0.0, |rgb| rgb[channel])).collect()
+        };
+        let stride = u64::from(self.capacity);
+        for channel in 0..3 {
+            gpu.write(&self.sh_dc, 4 * (channel as u64 * stride + first), bytemuck::cast_slice(&plane(0, channel)));
+        }
+        for ix in 0..n_sh_rest(self.sh_degree) as usize {
+            gpu.write(&self.sh_rest, 4 * (ix as u64 * stride + first), bytemuck::cast_slice(&plane(1 + ix / 3, ix % 3)));
+        }
+        let n_new = u32::try_from(n_new).expect("the caller has made room for u32 many");
+        self.set_n(gpu, self.n_splats + n_new);
+    }
+
+    /// Reads the parameters back.
+    pub(crate) fn read(&self, gpu: &Gpu) -> Result<SplatArrays, Error> {
+        let n = self.n_splats as usize;
+        let stride = self.capacity as usize;
+        let means: Vec<[f32; 4]> = gpu.read(&self.means, n)?;
+        let rotations: Vec<[f32; 4]> = gpu.read(&self.rotations, n)?;
+        let shapes: Vec<[f32; 4]> = gpu.read(&self.shapes, n)?;
+        let dc: Vec<f32> = gpu.read(&self.sh_dc, 3 * stride)?;
+        let n_rest = n_sh_rest(self.sh_degree) as usize;
+        let rest: Vec<f32> = gpu.read(&self.sh_rest, n_rest * stride)?;
+        let n_coeffs = 1 + n_rest / 3;
+        let coeff = |ix: usize, function: usize| -> [f32; 3] {
+            std::array::from_fn(|channel| if function == 0 { dc[channel * stride + ix] } else { rest[(3 * (function - 1) + channel) * stride + ix] })
+        };
+        let sh = (0..n).flat_map(|ix| (0..n_coeffs).map(move |function| (ix, function))).map(|(ix, function)| coeff(ix, function)).collect();
+        Ok(SplatArrays {
+            means: means.iter().map(|[x, y, z, _]| [*x, *y, *z]).collect(),
+            log_scales: shapes.iter().map(|[x, y, z, _]| [*x, *y, *z]).collect(),
+            rotations_wxyz: rotations,
+            opacity_logits: shapes.iter().map(|shape| shape[3]).collect(),
+            sh,
+            sh_degree: self.sh_degree,
+        })
+    }
+
+    /// Every per-splat buffer with its planes and bytes an entry.
+    fn planes(&self) -> [(&Buffer, u32, u64); 9] {
+        let rest = n_sh_rest(self.sh_degree);
+        [
+            (&self.means, 1, 16),
+            (&self.rotations, 1, 16),
+            (&self.shapes, 1, 16),
+            (&self.sh_dc, 3, 4),
+            (&self.sh_rest, rest, 4),
+            (&self.moments, 6, 16),
+            (&self.sh_dc_moments, 3, 8),
+            (&self.sh_rest_moments, rest, 8),
+            (&self.error_sums, 1, 4),
+        ]
+    }
+}
+
+/// What one view of the model needs while it is drawn, and learned from.
+#[derive(Debug)]
+pub(crate) struct Scratch {
+    pub(crate) n_splats: u32,
+    pub(crate) n_isect: u32,
+    pub(crate) n_buckets: u32,
+    pub(crate) n_tile_bits: u32,
+    pub(crate) capacity: Buffer,
+    pub(crate) drawn: Buffer,
+    pub(crate) tile_counts: Buffer,
+    pub(crate) slot_offsets: Buffer,
+    pub(crate) block_sums: Buffer,
+    pub(crate) by_depth: SortBuffers,
+    pub(crate) by_tile: SortBuffers,
+    pub(crate) slot_splats: Buffer,
+    pub(crate) sorted_splats: Buffer,
+    pub(crate) bucket_tiles: Buffer,
+    pub(crate) bucket_color: Buffer,
+    pub(crate) bucket_depth: Buffer,
+    pub(crate) gradients: Buffer,
+}
+
+/// Room a [`Scratch`] has.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct ScratchSize {
+    pub(crate) n_splats: u32,
+    pub(crate) n_isect: u32,
+    /// 0 where nothing is learned.
+    pub(crate) n_buckets: u32,
+    pub(crate) n_tiles: u32,
+}
+
+impl Scratch {
+    pub(crate) fn new(gpu: &Gpu, pipelines: &DrawPipelines, size: ScratchSize) -> Result<Self, Error> {
+        let words = |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n.max(1)));
+        let n_tile_bits = 32 - size.n_tiles.leading_zeros(); // One past the last tile is a key, too.
+        let learned = if size.n_buckets == 0 { 0 } else { u64::from(size.n_isect) };
+        Ok(Self {
+            n_splats: size.n_splats,
+            n_isect: size.n_isect,
+            n_buckets: size.n_buckets,
+            n_tile_bits,
+            capacity: gpu.uniform_with("splat.capacity", &Capacity { n_isect: size.n_isect, n_buckets: size.n_buckets, unused: [0; 2] }),
+            drawn: gpu.storage("splat.drawn", 48 * u64::from(size.n_splats))?,
+            tile_counts: words("splat.tile_counts", size.n_splats)?,
+            slot_offsets: words("splat.slot_offsets", size.n_splats)?,
+            block_sums: words("splat.block_sums", size.n_splats.div_ceil(1024))?,
+            by_depth: pipelines.sort.buffers(gpu, "splat.by_depth", size.n_splats, 32, status::N_SPLATS)?,
+            by_tile: pipelines.sort.buffers(gpu, "splat.by_tile", size.n_isect, n_tile_bits, status::N_ISECT)?,
+            slot_splats: words("splat.slot_splats", size.n_isect)?,
+            sorted_splats: words("splat.sorted_splats", size.n_isect)?,
+            bucket_tiles: words("splat.bucket_tiles", size.n_buckets)?,
+            bucket_color: gpu.storage("splat.bucket_color", 4096 * u64::from(size.n_buckets))?,
+            bucket_depth: gpu.storage("splat.bucket_depth", 1024 * u64::from(size.n_buckets))?,
+            gradients: gpu.storage("splat.gradients", 48 * learned)?,
+        })
+    }
+}
+
+/// Memory of one picture, and of its slopes where it is learned from.
+#[derive(Debug)]
+pub(crate) struct Frame {
+    pub(crate) n_pixels: u32,
+    pub(crate) n_tiles: u32,
+    pub(crate) image: Buffer,
+    pub(crate) depth: Buffer,
+    pub(crate) last: Buffer,
+    pub(crate) tile_ranges: Buffer,
+    pub(crate) bucket_starts: Buffer,
+    pub(crate) tile_last: Buffer,
+    pub(crate) pixels: Buffer,
+    pub(crate) depths: Buffer,
+    pub(crate) slopes: Buffer,
+    pub(crate) upstream: Buffer,
+    pub(crate) rest: Buffer,
+    pub(crate) errors: Buffer,
+}
+
+impl Frame {
+    /// Memory for pictures of up to `size_px`.
+    pub(crate) fn new(gpu: &Gpu, n_pixels: u32, n_tiles: u32, learned: bool) -> Result<Self, Error> {
+        let each = |name: &str, bytes: u64| gpu.storage(name, bytes * u64::from(n_pixels));
+        let slope = |name: &str, bytes: u64| gpu.storage(name, if learned { bytes * u64::from(n_pixels) } else { 0 });
+        let tiles = |name: &str, bytes: u64| gpu.storage(name, bytes * u64::from(n_tiles));
+        Ok(Self {
+            n_pixels,
+            n_tiles,
+            image: each("splat.image", 16)?,
+            depth: each("splat.depth", 4)?,
+            last: each("splat.last", 4)?,
+            tile_ranges: tiles("splat.tile_ranges", 8)?,
+            bucket_starts: tiles("splat.bucket_starts", 4)?,
+            tile_last: tiles("splat.tile_last", 4)?,
+            pixels: each("splat.pixels", 4)?,
+            depths: each("splat.depths", 4)?,
+            slopes: slope("splat.slopes", 36)?,
+            upstream: slope("splat.upstream", 16)?,
+            rest: slope("splat.rest", 8)?,
+            errors: tiles("splat.errors", 4)?,
+        })
+    }
+}
+
+/// Tiles of an image.
+pub(crate) fn n_tiles(size_px: [u32; 2]) -> u32 {
+    size_px[0].div_ceil(TILE_PX) * size_px[1].div_ceil(TILE_PX)
+}

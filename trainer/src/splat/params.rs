@@ -1,0 +1,148 @@
+//! Small structs the kernels read, with the layouts of their WGSL twins.
+
+use crate::gpu::{f32_of, f32s_of};
+use crate::{Aabb, Shutter};
+use kinematics::Transform;
+
+/// Edge of a tile, pixels.
+pub(crate) const TILE_PX: u32 = 16;
+
+/// `View` of shared/view.wgsl.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct View {
+    pub(crate) camera_rows: [[f32; 4]; 3],
+    pub(crate) center_in_world: [f32; 4],
+    pub(crate) focal_px: [f32; 2],
+    pub(crate) principal_px: [f32; 2],
+    pub(crate) size_px: [u32; 2],
+    pub(crate) n_tiles: [u32; 2],
+    pub(crate) shutter_linear: [f32; 4],
+    pub(crate) shutter_angular: [f32; 4],
+    pub(crate) crop_rows: [[f32; 4]; 3],
+    pub(crate) crop_min: [f32; 4],
+    pub(crate) crop_max: [f32; 4],
+}
+
+/// What a [`View`] is made of.
+#[derive(Clone, Debug)]
+pub(crate) struct Camera {
+    pub(crate) world_from_camera: Transform,
+    pub(crate) size_px: [u32; 2],
+    pub(crate) focal_px: [f64; 2],
+    pub(crate) principal_px: [f64; 2],
+    pub(crate) shutter: Option<Shutter>,
+    pub(crate) near_m: f64,
+    pub(crate) far_m: f64,
+    pub(crate) crop: Option<Aabb>,
+}
+
+impl Camera {
+    /// The same camera with an image `2^level` times smaller; rows and columns left over at the edges are cut.
+    pub(crate) fn at_level(&self, level: u32) -> Self {
+        let share = 0.5f64.powi(i32::try_from(level).expect("a few levels"));
+        Self {
+            size_px: self.size_px.map(|size| (size >> level).max(1)),
+            focal_px: self.focal_px.map(|focal| focal * share),
+            principal_px: self.principal_px.map(|principal| principal * share),
+            ..self.clone()
+        }
+    }
+
+    /// What the kernels read.
+    pub(crate) fn view(&self) -> View {
+        let shutter = |of: fn(&Shutter) -> nalgebra::Vector3<f64>| {
+            self.shutter.as_ref().map_or([0.0; 3], |shutter| f32s_of((of(shutter) * shutter.readout_secs).into()))
+        };
+        let linear = shutter(|shutter| shutter.twist.linear_m_s);
+        let angular = shutter(|shutter| shutter.twist.angular_rad_s);
+        let center = f32s_of::<3>(self.world_from_camera.translation.vector.into());
+        let with = |xyz: [f32; 3], w: f32| [xyz[0], xyz[1], xyz[2], w];
+        let crop_w = if self.crop.is_some() { 1.0 } else { 0.0 };
+        View {
+            camera_rows: rows_of(&self.world_from_camera.inverse()),
+            center_in_world: with(center, 0.0),
+            focal_px: f32s_of(self.focal_px),
+            principal_px: f32s_of(self.principal_px),
+            size_px: self.size_px,
+            n_tiles: self.size_px.map(|size| size.div_ceil(TILE_PX)),
+            shutter_linear: with(linear, f32_of(self.near_m)),
+            shutter_angular: with(angular, f32_of(self.far_m)),
+            crop_rows: rows_of(&self.crop.map_or(Transform::identity(), |crop| crop.world_from_box.inverse())),
+            crop_min: with(self.crop.map_or([0.0; 3], |crop| f32s_of(crop.min_m)), crop_w),
+            crop_max: with(self.crop.map_or([0.0; 3], |crop| f32s_of(crop.max_m)), 0.0),
+        }
+    }
+}
+
+/// The upper three rows of the transform's matrix.
+fn rows_of(transform: &Transform) -> [[f32; 4]; 3] {
+    let matrix = transform.to_homogeneous();
+    std::array::from_fn(|row| std::array::from_fn(|column| f32_of(matrix[(row, column)])))
+}
+
+/// `Model` of shared/model.wgsl.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct Model {
+    pub(crate) n_splats: u32,
+    pub(crate) capacity: u32,
+    pub(crate) sh_degree: u32,
+    pub(crate) n_sh_rest: u32,
+}
+
+/// `Capacity` of `scan_blocks.wgsl` and `bucket_offsets.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct Capacity {
+    pub(crate) n_isect: u32,
+    pub(crate) n_buckets: u32,
+    pub(crate) unused: [u32; 2],
+}
+
+/// `Rule` of update.wgsl: how parameters learn.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct Rule {
+    pub(crate) mean_rate_m: f32,
+    pub(crate) log_scale_rate: f32,
+    pub(crate) rotation_rate: f32,
+    pub(crate) opacity_rate: f32,
+    pub(crate) sh_dc_rate: f32,
+    pub(crate) sh_rest_rate: f32,
+    pub(crate) noise: f32,
+    pub(crate) final_mean_rate_frac: f32,
+    pub(crate) betas: [f32; 2],
+    pub(crate) epsilon: f32,
+    pub(crate) n_planned_steps: f32,
+    pub(crate) opacity_cost: f32,
+    pub(crate) scale_cost: f32,
+    pub(crate) log_scale_range: [f32; 2],
+    pub(crate) seed: u32,
+    pub(crate) update_all: u32,
+    pub(crate) unused: [u32; 2],
+}
+
+/// `Supervision` of shared/supervision.wgsl: what a picture is compared with and how.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct Supervision {
+    pub(crate) background_srgb: [f32; 3],
+    pub(crate) dssim_frac: f32,
+    pub(crate) depth_weight: f32,
+    pub(crate) depth_clip_m: f32,
+    pub(crate) unused: [f32; 2],
+}
+
+/// Indices into the status array, as in shared/status.wgsl.
+pub(crate) mod status {
+    pub(crate) const N_SPLATS: u32 = 0;
+    pub(crate) const N_ISECT: u32 = 1;
+    pub(crate) const FAILED: usize = 3;
+    pub(crate) const NEED_ISECT: usize = 4;
+    pub(crate) const NEED_BUCKETS: usize = 5;
+    pub(crate) const STEP: usize = 6;
+    pub(crate) const N_POISONED: usize = 7;
+    /// Length of the array.
+    pub(crate) const LEN: usize = 16;
+}

@@ -1,0 +1,226 @@
+//! The stages of drawing and learning, as lists of passes.
+
+use super::buffers::{Frame, Scratch, SplatBuffers, n_tiles};
+use super::kernels::{DrawPipelines, LearnPipelines};
+use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
+
+/// What the passes of one view touch.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct ViewPasses<'a> {
+    pub(crate) gpu: &'a Gpu,
+    pub(crate) splats: &'a SplatBuffers,
+    pub(crate) scratch: &'a Scratch,
+    pub(crate) frame: &'a Frame,
+    pub(crate) status: &'a Buffer,
+    pub(crate) view: &'a Buffer,
+    pub(crate) size_px: [u32; 2],
+}
+
+/// What a picture is compared with.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Target<'a> {
+    pub(crate) image: &'a Buffer,
+    pub(crate) depth: &'a Buffer,
+    pub(crate) supervision: &'a Buffer,
+    /// Whether D-SSIM is part of the loss.
+    pub(crate) ssim: bool,
+}
+
+impl ViewPasses<'_> {
+    /// Projects, sorts, bins and rasterizes; `rasterize` is the form that keeps states or the one that does not.
+    pub(crate) fn draw(&self, passes: &mut Passes, pipelines: &DrawPipelines, rasterize: &Pipeline) {
+        let Self { gpu, splats, scratch, frame, status, view, size_px } = *self;
+        let n_blocks = u64::from(splats.n_splats.div_ceil(1024));
+        passes.dispatch(
+            gpu,
+            &pipelines.project,
+            u64::from(splats.n_splats.div_ceil(256)),
+            &[
+                ("view", view),
+                ("model", &splats.model),
+                ("means", &splats.means),
+                ("rotations", &splats.rotations),
+                ("shapes", &splats.shapes),
+                ("sh_dc", &splats.sh_dc),
+                ("sh_rest", &splats.sh_rest),
+                ("drawn", &scratch.drawn),
+                ("depth_keys", &scratch.by_depth.keys[0]),
+                ("tile_counts", &scratch.tile_counts),
+            ],
+        );
+        let half = pipelines.sort.sort(gpu, passes, &scratch.by_depth, status, 32, true);
+        let by_depth = &scratch.by_depth.values[half];
+        let counted = [("model", &splats.model), ("by_depth", by_depth), ("tile_counts", &scratch.tile_counts), ("block_sums", &scratch.block_sums)];
+        passes.dispatch(gpu, &pipelines.count_blocks, n_blocks, &counted);
+        passes.dispatch(
+            gpu,
+            &pipelines.scan_blocks,
+            1,
+            &[("model", &splats.model), ("capacity", &scratch.capacity), ("block_sums", &scratch.block_sums), ("status", status)],
+        );
+        passes.dispatch(
+            gpu,
+            &pipelines.emit,
+            n_blocks,
+            &[
+                ("view", view),
+                ("model", &splats.model),
+                ("by_depth", by_depth),
+                ("tile_counts", &scratch.tile_counts),
+                ("drawn", &scratch.drawn),
+                ("block_sums", &scratch.block_sums),
+                ("status", status),
+                ("tile_keys", &scratch.by_tile.keys[0]),
+                ("slots", &scratch.by_tile.values[0]),
+                ("slot_splats", &scratch.slot_splats),
+                ("slot_offsets", &scratch.slot_offsets),
+            ],
+        );
+        let half = pipelines.sort.sort(gpu, passes, &scratch.by_tile, status, scratch.n_tile_bits, false);
+        passes.clear(&frame.tile_ranges);
+        passes.dispatch(
+            gpu,
+            &pipelines.ranges,
+            u64::from(scratch.n_isect.div_ceil(1024)),
+            &[
+                ("view", view),
+                ("status", status),
+                ("tile_keys", &scratch.by_tile.keys[half]),
+                ("slots", &scratch.by_tile.values[half]),
+                ("slot_splats", &scratch.slot_splats),
+                ("tile_ranges", &frame.tile_ranges),
+                ("sorted_splats", &scratch.sorted_splats),
+            ],
+        );
+        if scratch.n_buckets > 0 {
+            passes.dispatch(
+                gpu,
+                &pipelines.bucket_offsets,
+                1,
+                &[
+                    ("view", view),
+                    ("capacity", &scratch.capacity),
+                    ("tile_ranges", &frame.tile_ranges),
+                    ("bucket_starts", &frame.bucket_starts),
+                    ("status", status),
+                ],
+            );
+        }
+        passes.dispatch(
+            gpu,
+            rasterize,
+            u64::from(n_tiles(size_px)),
+            &[
+                ("view", view),
+                ("status", status),
+                ("tile_ranges", &frame.tile_ranges),
+                ("bucket_starts", &frame.bucket_starts),
+                ("sorted_splats", &scratch.sorted_splats),
+                ("drawn", &scratch.drawn),
+                ("image", &frame.image),
+                ("depth", &frame.depth),
+                ("last", &frame.last),
+                ("bucket_tiles", &scratch.bucket_tiles),
+                ("bucket_color", &scratch.bucket_color),
+                ("bucket_depth", &scratch.bucket_depth),
+                ("tile_last", &frame.tile_last),
+            ],
+        );
+    }
+
+    /// Packs the picture for people.
+    pub(crate) fn finish(&self, passes: &mut Passes, pipelines: &DrawPipelines, supervision: &Buffer) {
+        let n_pixels = self.size_px[0] * self.size_px[1];
+        passes.dispatch(
+            self.gpu,
+            &pipelines.finish,
+            u64::from(n_pixels.div_ceil(256)),
+            &[
+                ("view", self.view),
+                ("supervision", supervision),
+                ("image", &self.frame.image),
+                ("depth", &self.frame.depth),
+                ("pixels", &self.frame.pixels),
+                ("depths", &self.frame.depths),
+            ],
+        );
+    }
+
+    /// Compares the picture with its target: the slopes towards every pixel.
+    pub(crate) fn compare(&self, passes: &mut Passes, pipelines: &LearnPipelines, target: &Target<'_>) {
+        let Self { gpu, frame, view, .. } = *self;
+        let n_groups = u64::from(n_tiles(self.size_px));
+        let base = [("view", view), ("supervision", target.supervision), ("image", &frame.image), ("target_image", target.image)];
+        if target.ssim {
+            let mut buffers = base.to_vec();
+            buffers.push(("slopes", &frame.slopes));
+            passes.dispatch(gpu, &pipelines.ssim, n_groups, &buffers);
+        }
+        let mut buffers = base.to_vec();
+        buffers.extend([
+            ("depth", &frame.depth),
+            ("target_depth", target.depth),
+            ("slopes", &frame.slopes),
+            ("upstream", &frame.upstream),
+            ("rest", &frame.rest),
+            ("errors", &frame.errors),
+        ]);
+        passes.dispatch(gpu, if target.ssim { &pipelines.loss } else { &pipelines.loss_without_ssim }, n_groups, &buffers);
+    }
+
+    /// Carries the slopes from the pixels to the intersections.
+    pub(crate) fn backward(&self, passes: &mut Passes, pipelines: &LearnPipelines, draw: &DrawPipelines) {
+        let Self { gpu, scratch, frame, status, view, .. } = *self;
+        let half = draw.sort.half_after(scratch.n_tile_bits);
+        passes.dispatch(
+            gpu,
+            &pipelines.backward,
+            u64::from(scratch.n_buckets),
+            &[
+                ("view", view),
+                ("status", status),
+                ("tile_ranges", &frame.tile_ranges),
+                ("bucket_starts", &frame.bucket_starts),
+                ("bucket_tiles", &scratch.bucket_tiles),
+                ("tile_last", &frame.tile_last),
+                ("sorted_splats", &scratch.sorted_splats),
+                ("slots", &scratch.by_tile.values[half]),
+                ("drawn", &scratch.drawn),
+                ("bucket_color", &scratch.bucket_color),
+                ("bucket_depth", &scratch.bucket_depth),
+                ("upstream", &frame.upstream),
+                ("rest", &frame.rest),
+                ("last", &frame.last),
+                ("gradients", &scratch.gradients),
+            ],
+        );
+    }
+
+    /// Carries the slopes from the intersections to the parameters and takes the optimiser's step.
+    pub(crate) fn update(&self, passes: &mut Passes, update: &Pipeline, rule: &Buffer) {
+        let Self { gpu, splats, scratch, status, view, .. } = *self;
+        passes.dispatch(
+            gpu,
+            update,
+            u64::from(splats.n_splats.div_ceil(256)),
+            &[
+                ("view", view),
+                ("model", &splats.model),
+                ("rule", rule),
+                ("tile_counts", &scratch.tile_counts),
+                ("slot_offsets", &scratch.slot_offsets),
+                ("gradients", &scratch.gradients),
+                ("means", &splats.means),
+                ("rotations", &splats.rotations),
+                ("shapes", &splats.shapes),
+                ("sh_dc", &splats.sh_dc),
+                ("sh_rest", &splats.sh_rest),
+                ("moments", &splats.moments),
+                ("sh_dc_moments", &splats.sh_dc_moments),
+                ("sh_rest_moments", &splats.sh_rest_moments),
+                ("status", status),
+                ("error_sums", &splats.error_sums),
+            ],
+        );
+    }
+}

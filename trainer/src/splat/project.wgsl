@@ -1,0 +1,57 @@
+// project: place every splat on the image plane, color it, and count the tiles it touches.
+//
+// threads   one per splat
+// reads     view, model, means, rotations, shapes, sh_dc, sh_rest
+// writes    drawn [n_splats], depth_keys [n_splats] (bits of z; all ones where unseen), tile_counts [n_splats]
+// twin      splat/reference/project.rs
+// source    Zwicker et al. 2001 (EWA volume splatting); Kerbl et al. 2023, section 4
+
+#import view
+#import model
+#import projection
+#import tiles
+#import sh
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<uniform> model: Model;
+@group(0) @binding(2) var<storage, read> means: array<vec4f>;       // in world, metres; w unused
+@group(0) @binding(3) var<storage, read> rotations: array<vec4f>;   // w x y z, any length
+@group(0) @binding(4) var<storage, read> shapes: array<vec4f>;      // log_scale.xyz, opacity_logit
+@group(0) @binding(5) var<storage, read> sh_dc: array<f32>;         // 3 planes of `capacity`
+@group(0) @binding(6) var<storage, read> sh_rest: array<f32>;       // 3 planes a basis function
+@group(0) @binding(7) var<storage, read_write> drawn: array<Drawn>;
+@group(0) @binding(8) var<storage, read_write> depth_keys: array<u32>;
+@group(0) @binding(9) var<storage, read_write> tile_counts: array<u32>;
+
+override WG_SIZE = 256u;
+@compute @workgroup_size(WG_SIZE)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let splat_ix = folded(wg, n_wgs) * WG_SIZE + lane;
+    if splat_ix >= model.n_splats { return; } // Allowed here: no barrier, no subgroup operation below.
+    let mean = means[splat_ix].xyz;
+    let shape = shapes[splat_ix];
+    let projection = project_splat(view, mean, rotations[splat_ix], shape.xyz);
+    let opacity = sigmoid(shape.w);
+    depth_keys[splat_ix] = 0xffffffffu;
+    tile_counts[splat_ix] = 0u;
+    // Written so that a NaN anywhere is not seen.
+    let seen = projection.seen && opacity > MIN_ALPHA && projection.determinant > 0.0 && inside_crop(view, mean)
+        && abs(projection.mean_px.x) < 1e6 && abs(projection.mean_px.y) < 1e6 && projection.covariance.x + projection.covariance.z < 1e12;
+    if !seen { return; }
+
+    let conic = vec3f(projection.covariance.z, -projection.covariance.y, projection.covariance.x) / projection.determinant;
+    let reach = 2.0 * log(255.0 * opacity);
+    let n_touched = n_tiles_touched(Ellipse(projection.mean_px, conic, reach), view.n_tiles);
+    if n_touched == 0u { return; }
+
+    let direction = normalize(mean - view.center_in_world.xyz);
+    let basis = sh_basis(direction, model.sh_degree);
+    var color = vec3f(0.5) + SH_0 * vec3f(sh_dc[splat_ix], sh_dc[model.capacity + splat_ix], sh_dc[2u * model.capacity + splat_ix]);
+    for (var plane = 0u; plane < model.n_sh_rest; plane += 3u) {
+        let at = plane * model.capacity + splat_ix;
+        color += basis[plane / 3u] * vec3f(sh_rest[at], sh_rest[at + model.capacity], sh_rest[at + 2u * model.capacity]);
+    }
+    drawn[splat_ix] = Drawn(vec4f(projection.mean_px, projection.point.z, opacity), vec4f(conic, reach), vec4f(max(color, vec3f(0.0)), 0.0));
+    depth_keys[splat_ix] = bitcast<u32>(projection.point.z);
+    tile_counts[splat_ix] = n_touched;
+}

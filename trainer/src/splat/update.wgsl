@@ -1,0 +1,213 @@
+// update: sum each splat's gradients over its intersections, carry them to its parameters, and take one Adam step.
+//
+// threads   one per splat
+// reads     view, model, rule, tile_counts, slot_offsets, gradients, status
+// writes    means, rotations, shapes, sh_dc, sh_rest and their moments, error_sums; or, with GRADIENTS_ONLY, the gradients
+//           themselves in place of the values, for tests
+// twin      splat/reference/project.rs, backward; optim/reference.rs
+// source    Kerbl et al. 2023, appendix A; Kingma and Ba 2015; noise of Kheradmand et al. 2024 (3DGS-MCMC), section 4.1
+
+#import view
+#import model
+#import projection
+#import sh
+#import status
+#import random
+
+struct Gradient {
+    place: vec4f,      // mean_px.xy, depth, opacity
+    conic: vec4f,      // A, B, C; w: absolute error seen, weighted by contribution
+    color: vec4f,      // rgb; w: contribution, summed over pixels
+}
+
+struct Rule {
+    rates: vec4f,          // of mean (metres), log_scale, rotation, opacity_logit
+    sh_rates: vec4f,       // of the constant color, of the other functions; z: noise; w: final share of the mean's rate
+    decay: vec4f,          // Adam's beta 1, beta 2, epsilon; w: steps over which the mean's rate falls
+    cost: vec4f,           // of opacity, of scale (per splat); smallest and largest log_scale
+    seed: u32,
+    update_all: u32,       // 1: also splats that this view does not show
+    unused_0: u32,
+    unused_1: u32,
+}
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<uniform> model: Model;
+@group(0) @binding(2) var<uniform> rule: Rule;
+@group(0) @binding(3) var<storage, read> tile_counts: array<u32>;
+@group(0) @binding(4) var<storage, read> slot_offsets: array<u32>;
+@group(0) @binding(5) var<storage, read> gradients: array<Gradient>;
+@group(0) @binding(6) var<storage, read_write> means: array<vec4f>;
+@group(0) @binding(7) var<storage, read_write> rotations: array<vec4f>;
+@group(0) @binding(8) var<storage, read_write> shapes: array<vec4f>;
+@group(0) @binding(9) var<storage, read_write> sh_dc: array<f32>;
+@group(0) @binding(10) var<storage, read_write> sh_rest: array<f32>;
+@group(0) @binding(11) var<storage, read_write> moments: array<vec4f>;         // planes: first and second of means, rotations, shapes
+@group(0) @binding(12) var<storage, read_write> sh_dc_moments: array<vec2f>;   // first and second
+@group(0) @binding(13) var<storage, read_write> sh_rest_moments: array<vec2f>;
+@group(0) @binding(14) var<storage, read_write> status: array<atomic<u32>>;
+@group(0) @binding(15) var<storage, read_write> error_sums: array<f32>;        // since the last change of the splat count
+
+override WG_SIZE = 256u;
+override GRADIENTS_ONLY: bool = false;
+var<private> correction: vec2f;   // 1 / (1 - beta^t)
+
+fn adam4(plane: u32, splat_ix: u32, gradient: vec4f) -> vec4f {
+    let at = plane * model.capacity + splat_ix;
+    let first = mix(gradient, moments[at], rule.decay.x);
+    let second = mix(gradient * gradient, moments[at + model.capacity], rule.decay.y);
+    moments[at] = first;
+    moments[at + model.capacity] = second;
+    return first * correction.x / (sqrt(second * correction.y) + rule.decay.z);
+}
+
+fn adam1(moment: ptr<function, vec2f>, gradient: f32) -> f32 {
+    *moment = mix(vec2f(gradient, gradient * gradient), *moment, rule.decay.xy);
+    return (*moment).x * correction.x / (sqrt((*moment).y * correction.y) + rule.decay.z);
+}
+
+fn finite(x: vec4f) -> bool {
+    return all((bitcast<vec4u>(x) & vec4u(0x7f800000u)) != vec4u(0x7f800000u));
+}
+
+@compute @workgroup_size(WG_SIZE)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let splat_ix = folded(wg, n_wgs) * WG_SIZE + lane;
+    if splat_ix >= model.n_splats { return; } // Allowed here: no barrier, no subgroup operation below.
+    if atomicLoad(&status[FAILED]) != 0u { return; }
+    let n_touched = tile_counts[splat_ix];
+    if n_touched == 0u && rule.update_all == 0u && !GRADIENTS_ONLY { return; }
+
+    var sum: Gradient;
+    let begin = slot_offsets[splat_ix];
+    for (var slot = begin; slot < begin + n_touched; slot++) {
+        let part = gradients[slot];
+        sum.place += part.place;
+        sum.conic += part.conic;
+        sum.color += part.color;
+    }
+
+    let mean = means[splat_ix].xyz;
+    let rotation = rotations[splat_ix];
+    let shape = shapes[splat_ix];
+    let p = project_splat(view, mean, rotation, shape.xyz);
+    let opacity = sigmoid(shape.w);
+    var v_mean = vec3f(0.0);
+    var v_log_scale = vec3f(0.0);
+    var v_rotation = vec4f(0.0);
+    let v_opacity_logit = sum.place.w * opacity * (1.0 - opacity);
+    if n_touched != 0u {
+        // Conic to covariance: the inverse's derivative is -M G M.
+        let a = p.covariance.z / p.determinant;
+        let b = -p.covariance.y / p.determinant;
+        let c = p.covariance.x / p.determinant;
+        let ga = sum.conic.x; let gb = 0.5 * sum.conic.y; let gc = sum.conic.z;
+        let hxx = -(a * (a * ga + b * gb) + b * (a * gb + b * gc));
+        let hxy = -(b * (a * ga + b * gb) + c * (a * gb + b * gc));
+        let hyy = -(b * (b * ga + c * gb) + c * (b * gb + c * gc));
+        let row_x = p.jacobian_x * p.axes;
+        let row_y = p.jacobian_y * p.axes;
+        let v_row_x = 2.0 * (hxx * row_x + hxy * row_y);
+        let v_row_y = 2.0 * (hxy * row_x + hyy * row_y);
+        let v_jacobian_x = p.axes * v_row_x;
+        let v_jacobian_y = p.axes * v_row_y;
+        let v_axis_0 = p.jacobian_x * v_row_x.x + p.jacobian_y * v_row_y.x;
+        let v_axis_1 = p.jacobian_x * v_row_x.y + p.jacobian_y * v_row_y.y;
+        let v_axis_2 = p.jacobian_x * v_row_x.z + p.jacobian_y * v_row_y.z;
+        v_log_scale = vec3f(dot(v_axis_0, p.axes[0]), dot(v_axis_1, p.axes[1]), dot(v_axis_2, p.axes[2]));
+        let back = transpose(p.camera_rotation);
+        let v = mat3x3f(back * v_axis_0 * p.scale.x, back * v_axis_1 * p.scale.y, back * v_axis_2 * p.scale.z);
+
+        // Rotation matrix to quaternion; v[column][row].
+        let norm = max(length(rotation), 1e-12);
+        let q = rotation / norm;
+        let v_unit = 2.0 * vec4f(
+            q.y * (v[1][2] - v[2][1]) + q.z * (v[2][0] - v[0][2]) + q.w * (v[0][1] - v[1][0]),
+            -2.0 * q.y * (v[1][1] + v[2][2]) + q.z * (v[0][1] + v[1][0]) + q.w * (v[0][2] + v[2][0]) + q.x * (v[1][2] - v[2][1]),
+            q.y * (v[0][1] + v[1][0]) - 2.0 * q.z * (v[0][0] + v[2][2]) + q.w * (v[1][2] + v[2][1]) + q.x * (v[2][0] - v[0][2]),
+            q.y * (v[0][2] + v[2][0]) + q.z * (v[1][2] + v[2][1]) - 2.0 * q.w * (v[0][0] + v[1][1]) + q.x * (v[0][1] - v[1][0]),
+        );
+        v_rotation = (v_unit - q * dot(q, v_unit)) / norm;
+
+        // Image plane to camera to world.
+        let z = p.point.z;
+        let f = view.focal_px;
+        let ratio = -vec2f(p.jacobian_x.z, p.jacobian_y.z) * z / f; // clamped x/z, y/z
+        var v_point = vec3f(sum.place.xy * f / z, sum.place.z - dot(sum.place.xy * f, p.point.xy) / (z * z));
+        v_point.x -= p.unclamped.x * v_jacobian_x.z * f.x / (z * z);
+        v_point.y -= p.unclamped.y * v_jacobian_y.z * f.y / (z * z);
+        v_point.z += -v_jacobian_x.x * f.x / (z * z) - v_jacobian_y.y * f.y / (z * z)
+            + v_jacobian_x.z * f.x * ratio.x * (1.0 + p.unclamped.x) / (z * z)
+            + v_jacobian_y.z * f.y * ratio.y * (1.0 + p.unclamped.y) / (z * z);
+        let v_still = v_point + p.tau * cross(view.shutter_angular.xyz, v_point);
+        v_mean = view.camera_row_0.xyz * v_still.x + view.camera_row_1.xyz * v_still.y + view.camera_row_2.xyz * v_still.z;
+    }
+
+    // Color: recomputed for its clamp at 0, and for the gradient through the direction.
+    let to_splat = mean - view.center_in_world.xyz;
+    let distance = max(length(to_splat), 1e-6);
+    let direction = to_splat / distance;
+    let basis = sh_basis(direction, model.sh_degree);
+    let slopes = sh_basis_gradient(direction, model.sh_degree);
+    let capacity = model.capacity;
+    var color = vec3f(0.5) + SH_0 * vec3f(sh_dc[splat_ix], sh_dc[capacity + splat_ix], sh_dc[2u * capacity + splat_ix]);
+    for (var plane = 0u; plane < model.n_sh_rest; plane += 3u) {
+        let at = plane * capacity + splat_ix;
+        color += basis[plane / 3u] * vec3f(sh_rest[at], sh_rest[at + capacity], sh_rest[at + 2u * capacity]);
+    }
+    let v_color = select(vec3f(0.0), sum.color.rgb, color > vec3f(0.0));
+    var v_direction = vec3f(0.0);
+    for (var plane = 0u; plane < model.n_sh_rest; plane += 3u) {
+        let at = plane * capacity + splat_ix;
+        v_direction += slopes[plane / 3u] * dot(v_color, vec3f(sh_rest[at], sh_rest[at + capacity], sh_rest[at + 2u * capacity]));
+    }
+    v_mean += (v_direction - direction * dot(direction, v_direction)) / distance;
+
+    if GRADIENTS_ONLY {
+        means[splat_ix] = vec4f(v_mean, 0.0);
+        rotations[splat_ix] = v_rotation;
+        shapes[splat_ix] = vec4f(v_log_scale, v_opacity_logit);
+        for (var channel = 0u; channel < 3u; channel++) { sh_dc[channel * capacity + splat_ix] = SH_0 * v_color[channel]; }
+        for (var plane = 0u; plane < model.n_sh_rest; plane++) { sh_rest[plane * capacity + splat_ix] = basis[plane / 3u] * v_color[plane % 3u]; }
+        error_sums[splat_ix] = sum.conic.w;
+        return;
+    }
+    if !finite(vec4f(v_mean, v_opacity_logit)) || !finite(v_rotation) || !finite(vec4f(v_log_scale, sum.conic.w)) || !finite(vec4f(v_color, 0.0)) {
+        atomicAdd(&status[N_POISONED], 1u);
+        return;
+    }
+
+    let step = f32(atomicLoad(&status[STEP]));
+    correction = 1.0 / (1.0 - pow(rule.decay.xy, vec2f(step + 1.0)));
+    let fallen = pow(rule.sh_rates.w, min(step / max(rule.decay.w, 1.0), 1.0));
+    let mean_rate = rule.rates.x * fallen;
+    let cost_gradient = vec4f(rule.cost.y * p.scale, rule.cost.x * opacity * (1.0 - opacity));
+    let mean_step = adam4(0u, splat_ix, vec4f(v_mean, 0.0));
+    let rotation_step = adam4(2u, splat_ix, v_rotation);
+    let shape_step = adam4(4u, splat_ix, vec4f(v_log_scale, v_opacity_logit) + cost_gradient);
+
+    // Noise moves splats that hardly show, so that they find a place where they are of use.
+    let loose = 1.0 / (1.0 + exp(100.0 * (opacity - 0.005)));
+    let normal = normal3(vec3u(splat_ix, atomicLoad(&status[STEP]), rule.seed));
+    let stretched = p.rotation * (p.scale * p.scale * (transpose(p.rotation) * normal));
+    let jitter = rule.sh_rates.z * mean_rate * loose * stretched;
+
+    means[splat_ix] = vec4f(mean - mean_rate * mean_step.xyz + jitter, 0.0);
+    let turned = rotation - rule.rates.z * rotation_step;
+    rotations[splat_ix] = turned / max(length(turned), 1e-12);
+    let shaped = shape - vec4f(vec3f(rule.rates.y), rule.rates.w) * shape_step;
+    shapes[splat_ix] = vec4f(clamp(shaped.xyz, vec3f(rule.cost.z), vec3f(rule.cost.w)), clamp(shaped.w, -12.0, 12.0));
+    for (var channel = 0u; channel < 3u; channel++) {
+        let at = channel * capacity + splat_ix;
+        var moment = sh_dc_moments[at];
+        sh_dc[at] -= rule.sh_rates.x * adam1(&moment, SH_0 * v_color[channel]);
+        sh_dc_moments[at] = moment;
+    }
+    for (var plane = 0u; plane < model.n_sh_rest; plane++) {
+        let at = plane * capacity + splat_ix;
+        var moment = sh_rest_moments[at];
+        sh_rest[at] -= rule.sh_rates.y * adam1(&moment, basis[plane / 3u] * v_color[plane % 3u]);
+        sh_rest_moments[at] = moment;
+    }
+    error_sums[splat_ix] += sum.conic.w;
+}
