@@ -1,0 +1,113 @@
+//! One posed photo of a dataset, and the decoding of its files.
+
+use crate::Error;
+use image::{DynamicImage, ImageReader};
+use kinematics::{Intrinsics, Stamp, Transform};
+use std::path::{Path, PathBuf};
+
+/// One posed photo on disk.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DatasetFrame {
+    /// Name in the dataset, mostly the path of the image inside the folder.
+    pub name: String,
+    /// Lens parameters of the colour image at its own size.
+    pub intrinsics: Intrinsics,
+    /// Pose at `stamp`.
+    pub world_from_camera: Transform,
+    /// When the photo was taken; where the folder does not say, frames are a millisecond apart in the order of their names.
+    pub stamp: Stamp,
+    /// The colour image.
+    pub image_path: PathBuf,
+    /// Its depth, where there is any.
+    pub depth: Option<DepthFile>,
+    /// An image that is 0 where the photo must not be used.
+    pub mask_path: Option<PathBuf>,
+}
+
+/// A 16-bit depth image on disk.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DepthFile {
+    /// The file.
+    pub path: PathBuf,
+    /// Metres per count; a count of 0 is unknown.
+    pub metres_per_count: f64,
+    /// Pose of the depth camera when the depth image was taken.
+    pub world_from_camera: Transform,
+}
+
+/// The decoded files of one frame.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FrameImages {
+    /// `[height, width, 4]`, sRGB, still distorted; alpha is 0 where the mask or the photo's own alpha leaves a pixel out, else 255.
+    pub rgba_srgb: Vec<u8>,
+    /// Depth, still distorted.
+    pub depth: Option<DepthImage>,
+}
+
+/// Decoded depth with its own size.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DepthImage {
+    /// Lens parameters of the depth image: those of the photo at the size of the depth image.
+    pub intrinsics: Intrinsics,
+    /// `[height, width]`, metres along the camera's z axis; 0 where unknown.
+    pub depth_m: Vec<f32>,
+}
+
+impl DatasetFrame {
+    /// Decodes the files of this frame.
+    pub fn load(&self) -> Result<FrameImages, Error> {
+        let mut rgba = decoded(&self.image_path)?.into_rgba8();
+        self.require_size(&self.image_path, [rgba.width(), rgba.height()])?;
+        for pixel in rgba.pixels_mut() {
+            pixel.0[3] = if pixel.0[3] == 0 { 0 } else { 255 };
+        }
+        if let Some(mask_path) = &self.mask_path {
+            let mask = decoded(mask_path)?.into_luma8();
+            self.require_size(mask_path, [mask.width(), mask.height()])?;
+            for (pixel, keep) in rgba.pixels_mut().zip(mask.pixels()) {
+                pixel.0[3] = if keep.0[0] == 0 { 0 } else { pixel.0[3] };
+            }
+        }
+        let depth = self.depth.as_ref().map(|file| self.load_depth(file)).transpose()?;
+        Ok(FrameImages { rgba_srgb: rgba.into_raw(), depth })
+    }
+
+    fn load_depth(&self, file: &DepthFile) -> Result<DepthImage, Error> {
+        let DynamicImage::ImageLuma16(counts) = decoded(&file.path)? else {
+            return Err(Error::NotDepth { path: file.path.clone() });
+        };
+        #[expect(clippy::cast_possible_truncation, reason = "16-bit counts keep more digits in f32 than sensors have")]
+        let metres_from_count = |count: &u16| (f64::from(*count) * file.metres_per_count) as f32;
+        Ok(DepthImage {
+            intrinsics: self.intrinsics.resized([counts.width(), counts.height()]),
+            depth_m: counts.as_raw().iter().map(metres_from_count).collect(),
+        })
+    }
+
+    fn require_size(&self, path: &Path, got_px: [u32; 2]) -> Result<(), Error> {
+        let expected_px = self.intrinsics.size_px;
+        if got_px == expected_px {
+            return Ok(());
+        }
+        Err(Error::DatasetImageSize { path: path.to_owned(), got_px, expected_px })
+    }
+}
+
+/// Width and height of an image, from its first bytes.
+pub(super) fn size_of(path: &Path) -> Result<[u32; 2], Error> {
+    let size = reader(path)?.into_dimensions().map_err(|source| not_decodable(path, source))?;
+    Ok(size.into())
+}
+
+fn decoded(path: &Path) -> Result<DynamicImage, Error> {
+    reader(path)?.decode().map_err(|source| not_decodable(path, source))
+}
+
+fn reader(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::File>>, Error> {
+    let open = || ImageReader::open(path)?.with_guessed_format();
+    open().map_err(|source| Error::Open { path: path.to_owned(), source })
+}
+
+fn not_decodable(path: &Path, source: image::ImageError) -> Error {
+    Error::DatasetImage { path: path.to_owned(), source }
+}

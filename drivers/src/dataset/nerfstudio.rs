@@ -1,0 +1,236 @@
+//! Folders with a `transforms.json`, as nerfstudio and instant-ngp write them.
+//!
+//! Their cameras look along -z with y up (OpenGL); poses are turned to ours here and nowhere else.
+
+use super::frame::size_of;
+use super::{Dataset, DatasetFrame, DepthFile, LeftOut};
+use crate::Error;
+use kinematics::{Intrinsics, Lens, Stamp, Transform, transform};
+use nalgebra::{UnitQuaternion, Vector3};
+use serde::Deserialize;
+use std::path::{Path, PathBuf};
+
+/// Name of the file that makes a folder one of these.
+pub const FILE_NAME: &str = "transforms.json";
+/// Depth counts are millimetres unless the file says otherwise.
+const DEFAULT_METRES_PER_COUNT: f64 = 0.001;
+/// Extensions tried when a path has none.
+const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
+
+/// Reads a folder, or the file itself.
+///
+/// Frames come in file-name order. Images that are not there or are no images are left out and counted; a pose that is not
+/// finite or not rigid, or a camera model we lack, is an error that names the frame.
+pub fn read(path: &Path) -> Result<Dataset, Error> {
+    let file = if path.is_file() { path.to_owned() } else { path.join(FILE_NAME) };
+    let folder = file.parent().unwrap_or(Path::new(".")).to_owned();
+    let text = std::fs::read_to_string(&file).map_err(|source| Error::Open { path: file.clone(), source })?;
+    let wrong = |reason: String| Error::DatasetFile { path: file.clone(), reason };
+    let mut document: Document = serde_json::from_str(&nan_as_null(&text)).map_err(|error| wrong(error.to_string()))?;
+    document.frames.sort_by(|a, b| a.file_path.cmp(&b.file_path));
+    let metres_per_count = document.depth_unit_scale_factor.unwrap_or(DEFAULT_METRES_PER_COUNT);
+    if !(metres_per_count.is_finite() && metres_per_count > 0.0) {
+        return Err(wrong(format!("depth_unit_scale_factor is {metres_per_count}, must be above 0")));
+    }
+
+    let (mut frames, mut left_out, mut notes) = (Vec::new(), LeftOut::default(), Vec::new());
+    for (ix, entry) in document.frames.iter().enumerate() {
+        let in_frame = |reason: String| wrong(format!("frame {:?}: {reason}", entry.file_path));
+        let world_from_camera = entry.world_from_camera().map_err(in_frame)?;
+        let Some(image_path) = existing(&folder, &entry.file_path) else {
+            left_out.missing.push(entry.file_path.clone());
+            continue;
+        };
+        let size_px = match size_of(&image_path) {
+            Ok(size_px) => size_px,
+            Err(error) => {
+                left_out.unusable.push((entry.file_path.clone(), reason_of(&error)));
+                continue;
+            }
+        };
+        let camera = entry.camera.or(&document.camera);
+        let intrinsics = camera.intrinsics(size_px).map_err(in_frame)?;
+        if notes.is_empty() && camera.size_px().is_some_and(|told| told != size_px) {
+            notes.push(format!("images are {}x{}, not as told; lens parameters follow", size_px[0], size_px[1]));
+        }
+        let depth_path = entry.depth_file_path.as_ref().and_then(|name| existing(&folder, name));
+        frames.push(DatasetFrame {
+            name: entry.file_path.clone(),
+            intrinsics,
+            world_from_camera,
+            stamp: Stamp(i64::try_from(ix).unwrap_or(i64::MAX).saturating_mul(1_000_000)),
+            image_path,
+            depth: depth_path.map(|path| DepthFile { path, metres_per_count, world_from_camera }),
+            mask_path: entry.mask_path.as_ref().map(|name| folder.join(name)),
+        });
+    }
+    let n_lost_depth = document.frames.iter().filter(|entry| entry.lacks_depth(&folder)).count();
+    if n_lost_depth > 0 {
+        notes.push(format!("{n_lost_depth} depth images are not there"));
+    }
+    left_out.dataset(&folder, frames, notes)
+}
+
+/// The whole file; keys we do not know are left alone.
+#[derive(Deserialize)]
+struct Document {
+    frames: Vec<Entry>,
+    depth_unit_scale_factor: Option<f64>,
+    #[serde(flatten)]
+    camera: Camera,
+}
+
+/// One frame; its own lens parameters go before the common ones.
+#[derive(Deserialize)]
+struct Entry {
+    file_path: String,
+    depth_file_path: Option<String>,
+    mask_path: Option<String>,
+    transform_matrix: Vec<Vec<Option<f64>>>,
+    #[serde(flatten)]
+    camera: Camera,
+}
+
+/// Lens parameters as the file names them.
+#[derive(Clone, Default, Deserialize)]
+struct Camera {
+    camera_model: Option<String>,
+    w: Option<f64>,
+    h: Option<f64>,
+    fl_x: Option<f64>,
+    fl_y: Option<f64>,
+    cx: Option<f64>,
+    cy: Option<f64>,
+    camera_angle_x: Option<f64>,
+    k1: Option<f64>,
+    k2: Option<f64>,
+    k3: Option<f64>,
+    k4: Option<f64>,
+    p1: Option<f64>,
+    p2: Option<f64>,
+    is_fisheye: Option<bool>,
+}
+
+impl Entry {
+    fn world_from_camera(&self) -> Result<Transform, String> {
+        let rows: Vec<f64> = self.transform_matrix.iter().flatten().map(|value| value.unwrap_or(f64::NAN)).collect();
+        let last_row = [0.0, 0.0, 0.0, 1.0];
+        let rows: [f64; 16] = match rows.len() {
+            12 => [rows.as_slice(), &last_row].concat(),
+            _ => rows,
+        }
+        .try_into()
+        .map_err(|rows: Vec<f64>| format!("transform_matrix has {} numbers, must be 4 rows of 4", rows.len()))?;
+        let world_from_opengl = transform::from_rows(&rows).map_err(|error| error.to_string())?;
+        Ok(world_from_opengl * opengl_from_camera())
+    }
+
+    fn lacks_depth(&self, folder: &Path) -> bool {
+        let there = |name: &String| existing(folder, name).is_some();
+        there(&self.file_path) && self.depth_file_path.as_ref().is_some_and(|name| !there(name))
+    }
+}
+
+/// Half a turn about x: theirs looks along -z with y up, ours along z with y down.
+pub fn opengl_from_camera() -> Transform {
+    let half_turn = UnitQuaternion::new_unchecked(nalgebra::Quaternion::new(0.0, 1.0, 0.0, 0.0));
+    Transform::from_parts(Vector3::zeros().into(), half_turn)
+}
+
+impl Camera {
+    /// These parameters where given, else the common ones.
+    fn or(&self, common: &Self) -> Self {
+        let model = || self.camera_model.clone().or_else(|| common.camera_model.clone());
+        Self {
+            camera_model: model(),
+            w: self.w.or(common.w),
+            h: self.h.or(common.h),
+            fl_x: self.fl_x.or(common.fl_x),
+            fl_y: self.fl_y.or(common.fl_y),
+            cx: self.cx.or(common.cx),
+            cy: self.cy.or(common.cy),
+            camera_angle_x: self.camera_angle_x.or(common.camera_angle_x),
+            k1: self.k1.or(common.k1),
+            k2: self.k2.or(common.k2),
+            k3: self.k3.or(common.k3),
+            k4: self.k4.or(common.k4),
+            p1: self.p1.or(common.p1),
+            p2: self.p2.or(common.p2),
+            is_fisheye: self.is_fisheye.or(common.is_fisheye),
+        }
+    }
+
+    /// The size the parameters are for, where the file tells it.
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "sizes are small; the cast saturates")]
+    fn size_px(&self) -> Option<[u32; 2]> {
+        Some([self.w? as u32, self.h? as u32])
+    }
+
+    /// Lens parameters for images of this size.
+    fn intrinsics(&self, image_px: [u32; 2]) -> Result<Intrinsics, String> {
+        let size_px = self.size_px().unwrap_or(image_px);
+        let [width, height] = size_px.map(f64::from);
+        let from_angle = || self.camera_angle_x.map(|angle_rad| 0.5 * width / (0.5 * angle_rad).tan());
+        let focal_x = self.fl_x.or_else(from_angle).ok_or("no focal length: neither fl_x nor camera_angle_x")?;
+        let told = Intrinsics {
+            size_px,
+            focal_px: [focal_x, self.fl_y.unwrap_or(focal_x)],
+            principal_px: [self.cx.unwrap_or(0.5 * width), self.cy.unwrap_or(0.5 * height)],
+            lens: self.lens()?,
+            rectified: false,
+        };
+        told.validate().map_err(|error| error.to_string())?;
+        Ok(told.resized(image_px))
+    }
+
+    fn lens(&self) -> Result<Lens, String> {
+        let [k1, k2, k3, k4, p1, p2] =
+            [self.k1, self.k2, self.k3, self.k4, self.p1, self.p2].map(Option::unwrap_or_default);
+        let fisheye = self.is_fisheye == Some(true);
+        match self.camera_model.as_deref() {
+            Some("OPENCV_FISHEYE") => Ok(Lens::KannalaBrandt([k1, k2, k3, k4])),
+            None if fisheye => Ok(Lens::KannalaBrandt([k1, k2, k3, k4])),
+            None | Some("OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL") => {
+                let coefficients = [k1, k2, p1, p2, k3];
+                match (k4 == 0.0, coefficients == [0.0; 5]) {
+                    (false, _) => Err(format!("k4 is {k4}: only fisheye lenses have a fourth radial coefficient here")),
+                    (true, true) => Ok(Lens::Pinhole),
+                    (true, false) => Ok(Lens::BrownConrady(coefficients)),
+                }
+            }
+            Some(other) => Err(format!("camera_model {other:?}, must be OPENCV, OPENCV_FISHEYE or PINHOLE")),
+        }
+    }
+}
+
+/// The file of this name, or with an extension added where it has none.
+fn existing(folder: &Path, name: &str) -> Option<PathBuf> {
+    let as_told = folder.join(name);
+    if as_told.is_file() {
+        return Some(as_told);
+    }
+    let candidates = EXTENSIONS.into_iter().map(|extension| folder.join(format!("{name}.{extension}")));
+    candidates.into_iter().find(|path| path.is_file())
+}
+
+/// The text of an error with what lies under it.
+fn reason_of(error: &Error) -> String {
+    std::error::Error::source(error).map_or_else(|| error.to_string(), ToString::to_string)
+}
+
+/// Python writes numbers JSON has not: `NaN` and `Infinity` outside of strings become null, so that the frame can be named.
+fn nan_as_null(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for (ix, part) in text.split('"').enumerate() {
+        if ix > 0 {
+            out.push('"');
+        }
+        // Names with an escaped quote shift what counts as a string; they hold no such number, so nothing changes for them.
+        if ix % 2 == 0 && (part.contains("NaN") || part.contains("Infinity")) {
+            out.push_str(&part.replace("-Infinity", "null").replace("Infinity", "null").replace("NaN", "null"));
+        } else {
+            out.push_str(part);
+        }
+    }
+    out
+}
