@@ -124,7 +124,7 @@ function spanOf(values: number[]): [number, number] {
 function ticks(min: number, max: number, n: number): number[] {
   const rough = (max - min) / n;
   const power = 10 ** Math.floor(Math.log10(rough));
-  const size = [1, 2, 5, 10].map((factor) => factor * power).find((candidate) => candidate >= rough)!;
+  const size = [1, 2, 5, 10].map((factor) => factor * power).find((candidate) => candidate >= 0.8 * rough)!;
   const found = [];
   for (let ix = Math.ceil(min / size); ix * size <= max; ix += 1) found.push(Number((ix * size).toPrecision(6)));
   return found;

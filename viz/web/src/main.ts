@@ -19,6 +19,8 @@ const connection = new Connection(`ws://${location.host}/ws`, {
   state(state, text) {
     element("connection").dataset.state = state;
     element("connection").textContent = text;
+    // Whoever steers by the picture must see that it stands still.
+    element("notice").textContent = state === "lost" ? text : "";
     if (state === "open") {
       view.picture.forget();
       asker.restart();
@@ -44,6 +46,7 @@ function receiveText(message: TextMessage): void {
       break;
     case "keyframes":
       view.overlays.setKeyframes(message.keyframes);
+      view.changed();
       break;
     case "error":
       asker.failed(message.id);
@@ -63,6 +66,7 @@ function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): 
       liveCamera = header;
       element("look-live", HTMLButtonElement).disabled = false;
       view.overlays.setLiveCamera({ ...header, world_from_camera: header.world_from_camera });
+      view.changed();
     }
   }
 }
@@ -70,6 +74,7 @@ function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): 
 async function showPicture(header: PictureHeader, payload: Uint8Array<ArrayBuffer>): Promise<void> {
   const millis = asker.answered(header);
   if (!(await view.picture.show(header, payload, view.emptyDepth))) return;
+  view.changed();
   element("notice").textContent = "";
   const [width, height] = header.size_px;
   const percent = Math.round(100 * header.scale);
@@ -85,6 +90,7 @@ function toggle(id: string, key: string, apply: (isOn: boolean) => void): void {
     const isOn = button.getAttribute("aria-pressed") !== "true";
     button.setAttribute("aria-pressed", String(isOn));
     apply(isOn);
+    view.changed();
   };
   action(id, key, flip);
 }

@@ -22,6 +22,8 @@ export class OrbitView {
   private readonly renderer: THREE.WebGLRenderer;
   private readonly controls: OrbitControls;
   private scene: Scene | null = null;
+  private isSteered = false;
+  private isStale = true;
 
   constructor(private readonly canvas: HTMLCanvasElement, onMove: () => void) {
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
@@ -33,9 +35,11 @@ export class OrbitView {
     this.camera.up.set(0, 0, 1);
     this.camera.position.set(1, -1, 1);
     this.controls = new OrbitControls(this.camera, canvas);
-    this.controls.enableDamping = true;
-    this.controls.dampingFactor = 0.18;
-    this.controls.addEventListener("change", onMove);
+    this.controls.addEventListener("change", () => {
+      this.isStale = true;
+      onMove();
+    });
+    this.controls.addEventListener("start", () => (this.isSteered = true));
     this.world.add(this.picture.mesh, this.overlays.root);
     new ResizeObserver(() => {
       this.fit();
@@ -44,18 +48,19 @@ export class OrbitView {
     this.fit();
   }
 
-  /** Adopts a scene; the camera goes to its first view unless it already looks at that scene. */
+  /** Adopts a scene; the camera goes to its first view unless somebody has steered already. */
   setScene(scene: Scene): void {
     const isNew = JSON.stringify(scene) !== JSON.stringify(this.scene);
     this.scene = scene;
     if (!isNew) return;
+    this.isStale = true;
     this.overlays.setScene(scene);
     this.camera.near = Math.max(0.005 * scene.radius_m, 0.005);
     this.camera.far = 400 * this.camera.near + 40 * scene.radius_m;
     this.camera.updateProjectionMatrix();
     this.controls.minDistance = 2 * this.camera.near;
     this.controls.maxDistance = 12 * scene.radius_m;
-    this.reset();
+    if (!this.isSteered) this.reset();
   }
 
   /** Back to the scene's first view. */
@@ -96,8 +101,15 @@ export class OrbitView {
     return 0.9 * this.camera.far;
   }
 
+  /** Something in the view has changed. */
+  changed(): void {
+    this.isStale = true;
+  }
+
+  /** Draws if something has changed: on a robot's computer the page shares its cores with everything else. */
   draw(): void {
-    this.controls.update();
+    if (!this.isStale) return;
+    this.isStale = false;
     this.renderer.render(this.world, this.camera);
   }
 
@@ -106,5 +118,6 @@ export class OrbitView {
     this.renderer.setSize(clientWidth, clientHeight, false);
     this.camera.aspect = clientWidth / Math.max(1, clientHeight);
     this.camera.updateProjectionMatrix();
+    this.isStale = true;
   }
 }

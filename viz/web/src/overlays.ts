@@ -79,7 +79,7 @@ function axes(length: number): THREE.LineSegments {
   return helper;
 }
 
-/** Ends of the edges of a frustum and of a short stroke on its upper side, in world. */
+/** Ends of the edges of a frustum and of a small roof on its upper side, in world. */
 function frustum(camera: PosedCamera, depth: number): THREE.Vector3[] {
   const pose = worldFromCamera(camera.world_from_camera);
   const [width, height] = camera.size_px;
@@ -92,5 +92,6 @@ function frustum(camera: PosedCamera, depth: number): THREE.Vector3[] {
   const eye = new THREE.Vector3().applyMatrix4(pose);
   const corners = [at(0, 0), at(width, 0), at(width, height), at(0, height)];
   const edges = corners.flatMap((corner, ix) => [eye, corner, corner, corners[(ix + 1) % 4]!]);
-  return [...edges, at(0.4 * width, -0.12 * height), at(0.6 * width, -0.12 * height)];
+  const [left, right, top] = [at(0.35 * width, 0), at(0.65 * width, 0), at(0.5 * width, -0.2 * height)];
+  return [...edges, left, top, top, right];
 }

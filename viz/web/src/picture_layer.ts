@@ -17,19 +17,25 @@ const VERTEX = /* glsl */ `
   uniform vec2 focalPx;
   uniform vec2 principalPx;
   uniform float emptyDepth;
-  varying vec2 place;
+  varying vec3 pointInPicture;
   void main() {
-    place = position.xy;
+    vec2 place = position.xy;
     float depth = texture2D(depthMap, place).r;
     if (!(depth > 0.0)) depth = emptyDepth;
-    vec3 pointInPicture = vec3((place * sizePx - principalPx) / focalPx, 1.0) * depth;
+    pointInPicture = vec3((place * sizePx - principalPx) / focalPx, 1.0) * depth;
     gl_Position = projectionMatrix * viewMatrix * worldFromPicture * vec4(pointInPicture, 1.0);
   }`;
 
+// Colors are looked up by projection, not by the grid's own coordinates: where a triangle spans a jump in depth,
+// the picture still is the picture when seen from its own pose.
 const FRAGMENT = /* glsl */ `
   uniform sampler2D colorMap;
-  varying vec2 place;
+  uniform vec2 sizePx;
+  uniform vec2 focalPx;
+  uniform vec2 principalPx;
+  varying vec3 pointInPicture;
   void main() {
+    vec2 place = (focalPx * pointInPicture.xy / pointInPicture.z + principalPx) / sizePx;
     gl_FragColor = vec4(texture2D(colorMap, place).rgb, 1.0);
   }`;
 

@@ -22,8 +22,8 @@ const REFRESH_SHARE = 0.25;
 /** A moving picture that takes longer is asked for smaller, one that takes less than a third of it larger. */
 const MOVING_MILLIS = 110;
 const MOVING_SCALES = [0.1, 0.15, 0.25, 0.35, 0.5];
-/** An answer that does not come within this time is not waited for. */
-const PATIENCE_MILLIS = 3000;
+/** An answer that does not come within this time is not waited for, while moving and at rest. */
+const PATIENCE_MILLIS = { moving: 3000, resting: 30_000 };
 
 export class RenderAsker {
   private id = 0;
@@ -46,6 +46,8 @@ export class RenderAsker {
   /** The view has changed. */
   moved(): void {
     this.movedAt = performance.now();
+    // A full picture of the old view is not waited for: the next request replaces it.
+    if (this.isRested) this.isWaiting = false;
     this.isRested = false;
   }
 
@@ -80,7 +82,8 @@ export class RenderAsker {
   tick(): void {
     if (!this.connection.isOpen) return;
     const now = performance.now();
-    if (this.isWaiting && now - this.askedAt > PATIENCE_MILLIS && !this.isRested) this.isWaiting = false;
+    const patience = this.isRested ? PATIENCE_MILLIS.resting : PATIENCE_MILLIS.moving;
+    if (now - this.askedAt > patience) this.isWaiting = false;
     if (!this.isRested && now - this.movedAt > REST_MILLIS) {
       this.isRested = true;
       this.ask(this.stages()); // Replaces whatever is on its way.
