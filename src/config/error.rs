@@ -1,0 +1,45 @@
+//! What can be wrong with a rig file.
+
+use std::path::PathBuf;
+
+/// Why a rig file was not accepted: one sentence that names the file, the line and the key.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub(crate) enum ConfigError {
+    /// A file is missing or unreadable.
+    #[error("cannot read {what} {path:?}")]
+    Read { what: &'static str, path: PathBuf, source: std::io::Error },
+    /// The text is not TOML.
+    #[error("{file} line {line}: {message}")]
+    Syntax { file: String, line: usize, message: String },
+    /// A key that no rig file has.
+    #[error("{at}: unknown key {key:?}{}", .nearest.as_ref().map(|near| format!(", did you mean {near:?}?")).unwrap_or_default())]
+    UnknownKey { at: Place, key: String, nearest: Option<String> },
+    /// A key that every rig file needs.
+    #[error("{file}: the key {key:?} is missing: {meaning}")]
+    Missing { file: String, key: String, meaning: &'static str },
+    /// A value that is not allowed.
+    #[error("{at}: {key} is {got}, allowed: {allowed}")]
+    Wrong { at: Place, key: String, got: String, allowed: String },
+    /// The robot's description does not fit the rig.
+    #[error("{file}: {key}: {reason}")]
+    Robot { file: String, key: &'static str, reason: String },
+}
+
+/// Where a value comes from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Place {
+    /// A line of the rig file, from 1.
+    Line { file: String, line: usize },
+    /// A flag that overrides the key.
+    Flag,
+}
+
+impl std::fmt::Display for Place {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Line { file, line } => write!(f, "{file} line {line}"),
+            Self::Flag => f.write_str("command line"),
+        }
+    }
+}

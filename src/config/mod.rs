@@ -1,0 +1,232 @@
+//! The rig file: TOML -> checked types, and back to the settled file that repeats a run.
+//!
+//! Every key is in `docs/rig.md`. Unknown keys are refused, flags override keys of the same name.
+
+mod error;
+mod read;
+mod section;
+#[cfg(test)]
+mod tests;
+mod write;
+
+pub(crate) use error::ConfigError;
+
+use kinematics::{Intrinsics, Transform};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// A checked rig.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Rig {
+    pub(crate) arm: Arm,
+    pub(crate) base: Base,
+    /// By name.
+    pub(crate) cameras: Vec<Camera>,
+    pub(crate) join: JoinConfig,
+    pub(crate) train: Train,
+    pub(crate) sim: Sim,
+}
+
+/// The arm that carries or is seen by the cameras.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Arm {
+    pub(crate) driver: ArmDriver,
+    /// Network address or bus of the device; empty where the driver needs none.
+    pub(crate) address: String,
+    /// The robot's description, whole.
+    pub(crate) urdf_text: String,
+    /// Moving joints in the order of the readings.
+    pub(crate) joints: Vec<String>,
+    pub(crate) base_link: String,
+    pub(crate) flange_link: String,
+    pub(crate) max_speed_rad_s: f64,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum ArmDriver {
+    Franka,
+    Can,
+    Udp,
+    Sim,
+}
+
+/// Where the base stands.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Base {
+    pub(crate) driver: BaseDriver,
+    pub(crate) world_from_base: Transform,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum BaseDriver {
+    Fixed,
+    Tags,
+    Rgbd,
+    Udp,
+    Sim,
+}
+
+/// One camera, colour and, where it has that, depth.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Camera {
+    pub(crate) name: Arc<str>,
+    pub(crate) driver: CameraDriver,
+    /// Path or serial number; empty where the driver needs none.
+    pub(crate) device: String,
+    pub(crate) rate_hz: f64,
+    /// `None`: the camera chooses and, if it can, tells it with each image.
+    pub(crate) exposure_micros: Option<f64>,
+    /// First row to last row; `None` is unknown, 0 a global shutter.
+    pub(crate) readout_micros: Option<f64>,
+    /// What is added to a stamp to reach mid-exposure; `None` is unknown.
+    pub(crate) stamp_to_mid_exposure: Option<Measured>,
+    pub(crate) parent: Parent,
+    pub(crate) parent_from_camera: Transform,
+    pub(crate) intrinsics: Intrinsics,
+    pub(crate) depth: Option<Depth>,
+    pub(crate) sim: CameraSim,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum CameraDriver {
+    Realsense,
+    V4l2,
+    Nokhwa,
+    Sim,
+}
+
+/// The frame that a camera is fixed to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Parent {
+    Flange,
+    Base,
+    World,
+}
+
+/// A measured time, milliseconds.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Measured {
+    pub(crate) value_millis: f64,
+    pub(crate) sigma_millis: f64,
+    /// What measured it.
+    pub(crate) source: String,
+}
+
+/// Depth images of a camera.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Depth {
+    pub(crate) intrinsics: Intrinsics,
+    /// Pose of the depth images' optical frame in that of the colour images.
+    pub(crate) camera_from_depth: Transform,
+    /// Readings outside count as nothing seen.
+    pub(crate) min_m: f64,
+    pub(crate) max_m: f64,
+}
+
+/// Flaws of a simulated camera.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct CameraSim {
+    pub(crate) noise_sigma: f64,
+    pub(crate) shot_frac: f64,
+    pub(crate) blur_samples: u32,
+    pub(crate) latency_millis: f64,
+    pub(crate) dropped_frac: f64,
+    pub(crate) supersample: u32,
+    pub(crate) depth_noise_sigma_m: f64,
+    pub(crate) depth_hole_frac: f64,
+    pub(crate) metres_per_count: f64,
+}
+
+/// Which images become keyframes, and how many are kept.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct JoinConfig {
+    pub(crate) start_keyframes: usize,
+    pub(crate) max_keyframes: usize,
+    pub(crate) max_bytes: u64,
+    pub(crate) min_translation_m: f64,
+    pub(crate) min_rotation_rad: f64,
+    pub(crate) fixed_interval_millis: f64,
+    pub(crate) fixed_keyframes: usize,
+    pub(crate) min_sharpness_frac: f64,
+    pub(crate) max_blur_px: f64,
+    pub(crate) max_shear_px: f64,
+    pub(crate) min_luma_frac: f64,
+    pub(crate) max_luma_frac: f64,
+    pub(crate) max_clipped_frac: f64,
+    pub(crate) default_depth_m: f64,
+    pub(crate) max_gap_millis: f64,
+    pub(crate) max_wait_millis: f64,
+}
+
+/// How the model is trained.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Train {
+    pub(crate) method: String,
+    pub(crate) max_splats: Option<u64>,
+    pub(crate) max_bytes: Option<u64>,
+    pub(crate) seed: u64,
+    pub(crate) sh_degree: u32,
+    pub(crate) scale: f64,
+}
+
+/// What a simulated rig does; used by `--sim` and by drivers named `sim`.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Sim {
+    pub(crate) scene: String,
+    pub(crate) seed: u64,
+    pub(crate) ideal: bool,
+    /// The simulation waits for the trainer, and gives the same samples every time.
+    pub(crate) lockstep: bool,
+    pub(crate) speed: f64,
+    pub(crate) duration_secs: Option<f64>,
+    pub(crate) n_images: Option<u64>,
+    pub(crate) truth: bool,
+    pub(crate) truth_depth: bool,
+}
+
+/// A value from the command line that replaces a key of the rig file.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Override {
+    key: &'static str,
+    value: toml::Value,
+}
+
+impl Override {
+    /// `key` is dotted, as in `docs/rig.md`.
+    pub(crate) fn new(key: &'static str, value: impl Into<toml::Value>) -> Self {
+        Self { key, value: value.into() }
+    }
+}
+
+impl Rig {
+    /// Reads and checks a rig file and the robot's description that it names.
+    pub(crate) fn load(path: &Path, overrides: &[Override]) -> Result<Self, ConfigError> {
+        let text = read_file("the rig file", path)?;
+        let file =
+            path.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned());
+        let folder = path.parent().unwrap_or(Path::new("")).to_owned();
+        read::rig(&file, &text, overrides, |urdf| read_file("the robot's description", &folder.join(urdf)))
+    }
+
+    /// Checks the text of a rig file whose robot is described by `urdf_text`; `file` is its name in messages.
+    pub(crate) fn parse(file: &str, text: &str, urdf_text: &str, overrides: &[Override]) -> Result<Self, ConfigError> {
+        read::rig(file, text, overrides, |_| Ok(urdf_text.to_owned()))
+    }
+
+    /// The settled rig file: every key, so that it gives the same rig again. The robot's description lies beside it.
+    pub(crate) fn to_toml(&self) -> String {
+        write::rig(self)
+    }
+
+    /// Writes the settled rig file and the robot's description into a folder, and says where the rig file is.
+    pub(crate) fn write_settled(&self, folder: &Path) -> std::io::Result<PathBuf> {
+        let path = folder.join(drivers::recording::RIG_FILE);
+        std::fs::write(folder.join(drivers::recording::URDF_FILE), &self.arm.urdf_text)?;
+        std::fs::write(&path, self.to_toml())?;
+        Ok(path)
+    }
+}
+
+fn read_file(what: &'static str, path: &Path) -> Result<String, ConfigError> {
+    std::fs::read_to_string(path).map_err(|source| ConfigError::Read { what, path: path.to_owned(), source })
+}

@@ -1,0 +1,355 @@
+//! From the text of a rig file to the checked rig: every key, its default and its range.
+
+use super::section::{Reading, Section};
+use super::{
+    Arm, ArmDriver, Base, BaseDriver, Camera, CameraDriver, CameraSim, ConfigError, Depth, JoinConfig, Measured,
+    Override, Parent, Rig, Sim, Train,
+};
+use kinematics::{Chain, Intrinsics, Lens, Transform};
+use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+use toml::{Table, Value};
+
+pub(super) const ARM_DRIVERS: [(&str, ArmDriver); 4] =
+    [("franka", ArmDriver::Franka), ("can", ArmDriver::Can), ("udp", ArmDriver::Udp), ("sim", ArmDriver::Sim)];
+pub(super) const BASE_DRIVERS: [(&str, BaseDriver); 5] = [
+    ("fixed", BaseDriver::Fixed),
+    ("tags", BaseDriver::Tags),
+    ("rgbd", BaseDriver::Rgbd),
+    ("udp", BaseDriver::Udp),
+    ("sim", BaseDriver::Sim),
+];
+pub(super) const CAMERA_DRIVERS: [(&str, CameraDriver); 4] = [
+    ("realsense", CameraDriver::Realsense),
+    ("v4l2", CameraDriver::V4l2),
+    ("nokhwa", CameraDriver::Nokhwa),
+    ("sim", CameraDriver::Sim),
+];
+pub(super) const PARENTS: [(&str, Parent); 3] =
+    [("flange", Parent::Flange), ("base", Parent::Base), ("world", Parent::World)];
+const METHODS: [(&str, &str); 3] = [("splat", "splat"), ("nerf", "nerf"), ("tsdf", "tsdf")];
+/// Poses and lens coefficients beyond this are slips of the pen.
+const FAR: f64 = 1e4;
+/// A quaternion this close to length one is taken as it is, so that a settled file gives the same bits again.
+const UNIT_CLOSE: f64 = 1e-12;
+
+/// Reads a rig; `read_urdf` gives the robot's description for the path in the file.
+pub(super) fn rig(
+    file: &str,
+    text: &str,
+    overrides: &[Override],
+    read_urdf: impl FnOnce(&str) -> Result<String, ConfigError>,
+) -> Result<Rig, ConfigError> {
+    let (mut rig, urdf_path, reading) = keys(file, text, overrides)?;
+    if let Some(problem) = reading.into_problem() {
+        return Err(problem);
+    }
+    rig.arm.urdf_text = read_urdf(&urdf_path)?;
+    settle_joints(file, &mut rig.arm)?;
+    Ok(rig)
+}
+
+/// Reads all keys: the rig without its robot, the path of the robot's description, and what is wrong.
+pub(super) fn keys(file: &str, text: &str, overrides: &[Override]) -> Result<(Rig, String, Reading), ConfigError> {
+    let reading = Reading::new(file, text, overrides.iter().map(|flag| flag.key.to_owned()).collect())?;
+    let syntax =
+        |e: toml::de::Error| ConfigError::Syntax { file: file.to_owned(), line: 1, message: e.message().to_owned() };
+    let mut table: Table = toml::from_str(text).map_err(syntax)?;
+    for flag in overrides {
+        set(&mut table, flag.key, flag.value.clone());
+    }
+    let mut root = Section::root(&reading, table);
+    let (arm, urdf_path) = arm(root.section("arm"));
+    let base = base(root.section("base"));
+    let cameras = cameras(&mut root);
+    let join = join(root.section("join"));
+    let train = train(root.section("train"));
+    let sim = sim(root.section("sim"));
+    root.end();
+    Ok((Rig { arm, base, cameras, join, train, sim }, urdf_path, reading))
+}
+
+/// Replaces the value of a dotted key, making tables on the way.
+fn set(table: &mut Table, key: &str, value: Value) {
+    match key.split_once('.') {
+        None => {
+            table.insert(key.to_owned(), value);
+        }
+        Some((parent, rest)) => {
+            let inner = table.entry(parent.to_owned()).or_insert_with(|| Value::Table(Table::new()));
+            if let Value::Table(inner) = inner {
+                set(inner, rest, value);
+            }
+        }
+    }
+}
+
+/// Checks links and joints against the robot's description and fills in the joints that were not named.
+fn settle_joints(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
+    let robot = |key, e: kinematics::Error| ConfigError::Robot { file: file.to_owned(), key, reason: e.to_string() };
+    if arm.base_link.is_empty() {
+        let description = kinematics::urdf::Robot::parse(&arm.urdf_text).map_err(|e| robot("arm.urdf", e))?;
+        arm.base_link = description.root().map_err(|e| robot("arm.urdf", e))?.to_owned();
+    }
+    let chain =
+        Chain::from_urdf(&arm.urdf_text, &arm.base_link, &arm.flange_link).map_err(|e| robot("arm.flange_link", e))?;
+    if arm.joints.is_empty() {
+        arm.joints = chain.joint_names().to_vec();
+    }
+    chain.order_in(&arm.joints).map(|_| ()).map_err(|e| robot("arm.joints", e))
+}
+
+fn arm(mut keys: Section<'_>) -> (Arm, String) {
+    let driver = keys.choice("driver", &ARM_DRIVERS);
+    if driver.is_none() {
+        keys.missing("driver", "franka, can, udp or sim");
+    }
+    let urdf = keys.text("urdf");
+    if urdf.is_none() {
+        keys.missing("urdf", "path of the robot's description, relative to the rig file");
+    }
+    let flange_link = keys.text("flange_link");
+    if flange_link.is_none() {
+        keys.missing("flange_link", "the link that cameras with the parent flange are fixed to");
+    }
+    let arm = Arm {
+        driver: driver.unwrap_or(ArmDriver::Sim),
+        address: keys.text("address").unwrap_or_default(),
+        urdf_text: String::new(),
+        joints: keys.texts("joints").unwrap_or_default(),
+        base_link: keys.text("base_link").unwrap_or_default(),
+        flange_link: flange_link.unwrap_or_default(),
+        max_speed_rad_s: keys.number("max_speed_rad_s", 0.0..=10.0).unwrap_or(0.5),
+    };
+    keys.end();
+    (arm, urdf.unwrap_or_default())
+}
+
+fn base(mut keys: Section<'_>) -> Base {
+    let base = Base {
+        driver: keys.choice("driver", &BASE_DRIVERS).unwrap_or(BaseDriver::Fixed),
+        world_from_base: pose(&mut keys, "world_from_base").unwrap_or_else(Transform::identity),
+    };
+    keys.end();
+    base
+}
+
+fn cameras(root: &mut Section<'_>) -> Vec<Camera> {
+    let sections = root.named_sections("camera");
+    if sections.is_empty() {
+        root.missing("camera", "at least one table [camera.NAME]");
+    }
+    sections.into_iter().map(|(name, keys)| camera(&name, keys)).collect()
+}
+
+fn camera(name: &str, mut keys: Section<'_>) -> Camera {
+    let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+    if name.is_empty() || !name.chars().all(plain) {
+        keys.wrong::<()>("name", &Value::String(name.to_owned()), "letters, digits, _ and -");
+    }
+    let driver = keys.choice("driver", &CAMERA_DRIVERS);
+    if driver.is_none() {
+        keys.missing("driver", "realsense, v4l2, nokhwa or sim");
+    }
+    let size_px = size_px(&mut keys);
+    if size_px.is_none() {
+        keys.missing("size_px", "width and height of the images");
+    }
+    let rate_hz = keys.number("rate_hz", 0.01..=1000.0);
+    if rate_hz.is_none() {
+        keys.missing("rate_hz", "images a second");
+    }
+    let parent = keys.choice("parent", &PARENTS);
+    if parent.is_none() {
+        keys.missing("parent", "flange, base or world");
+    }
+    let rectified = keys.flag("rectified").unwrap_or(false);
+    let intrinsics = intrinsics(&mut keys, size_px.unwrap_or([1, 1]), rectified);
+    if intrinsics.is_none() {
+        keys.missing("intrinsics", "focal_px, principal_px and, if the lens distorts, lens and distortion");
+    }
+    let intrinsics = intrinsics.unwrap_or(UNKNOWN_LENS);
+    let period_micros = 1e6 / rate_hz.unwrap_or(1.0);
+    let camera = Camera {
+        name: name.into(),
+        driver: driver.unwrap_or(CameraDriver::Sim),
+        device: keys.text("device").unwrap_or_default(),
+        rate_hz: rate_hz.unwrap_or(1.0),
+        exposure_micros: keys.number("exposure_micros", 0.0..=period_micros),
+        readout_micros: keys.number("readout_micros", 0.0..=period_micros),
+        stamp_to_mid_exposure: keys.optional_section("stamp_to_mid_exposure_millis").map(measured),
+        parent: parent.unwrap_or(Parent::Flange),
+        parent_from_camera: pose(&mut keys, "parent_from_camera").unwrap_or_else(Transform::identity),
+        depth: keys.optional_section("depth").map(|keys| depth(keys, &intrinsics)),
+        sim: camera_sim(keys.section("sim")),
+        intrinsics,
+    };
+    keys.end();
+    camera
+}
+
+/// Stands in until the missing key is told.
+const UNKNOWN_LENS: Intrinsics =
+    Intrinsics { size_px: [1, 1], focal_px: [1.0; 2], principal_px: [0.5; 2], lens: Lens::Pinhole, rectified: true };
+
+fn size_px(keys: &mut Section<'_>) -> Option<[u32; 2]> {
+    let [width, height] = keys.numbers::<2>("size_px", 8.0..=16384.0)?;
+    if width.fract() != 0.0 || height.fract() != 0.0 {
+        return keys.wrong("size_px", &Value::from(vec![width, height]), "whole numbers");
+    }
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "whole numbers up to 16384")]
+    Some([width as u32, height as u32])
+}
+
+fn intrinsics(keys: &mut Section<'_>, size_px: [u32; 2], rectified: bool) -> Option<Intrinsics> {
+    const LENSES: [(&str, &str); 3] =
+        [("pinhole", "pinhole"), ("brown_conrady", "brown_conrady"), ("kannala_brandt", "kannala_brandt")];
+    let mut keys = keys.optional_section("intrinsics")?;
+    let focal_px = keys.numbers::<2>("focal_px", 1.0..=1e6);
+    if focal_px.is_none() {
+        keys.missing("focal_px", "focal length along x and y in pixels");
+    }
+    let principal_px = keys.numbers::<2>("principal_px", -FAR..=3.0 * FAR);
+    if principal_px.is_none() {
+        keys.missing("principal_px", "principal point in pixels; the centre of the first pixel is (0.5, 0.5)");
+    }
+    let name = keys.choice("lens", &LENSES).unwrap_or("pinhole");
+    let distortion = keys.number_list("distortion").unwrap_or_default();
+    let lens = match (name, &distortion[..]) {
+        ("pinhole", _) => Some(Lens::Pinhole),
+        ("brown_conrady", [k1, k2, p1, p2, k3]) => Some(Lens::BrownConrady([*k1, *k2, *p1, *p2, *k3])),
+        ("kannala_brandt", [k1, k2, k3, k4]) => Some(Lens::KannalaBrandt([*k1, *k2, *k3, *k4])),
+        _ => keys.wrong(
+            "distortion",
+            &Value::from(distortion.clone()),
+            "5 (k1, k2, p1, p2, k3) for brown_conrady, 4 (k1, k2, k3, k4) for kannala_brandt",
+        ),
+    };
+    keys.end();
+    Some(Intrinsics { size_px, focal_px: focal_px?, principal_px: principal_px?, lens: lens?, rectified })
+}
+
+fn measured(mut keys: Section<'_>) -> Measured {
+    let value_millis = keys.number("value", -1000.0..=1000.0);
+    if value_millis.is_none() {
+        keys.missing("value", "milliseconds from the stamp to mid-exposure");
+    }
+    let measured = Measured {
+        value_millis: value_millis.unwrap_or_default(),
+        sigma_millis: keys.number("sigma", 0.0..=1000.0).unwrap_or(0.0),
+        source: keys.text("source").unwrap_or_default(),
+    };
+    keys.end();
+    measured
+}
+
+fn depth(mut keys: Section<'_>, color: &Intrinsics) -> Depth {
+    let size_px = size_px(&mut keys).unwrap_or(color.size_px);
+    let rectified = keys.flag("rectified").unwrap_or(color.rectified);
+    // Depth of the size of the colour is registered to it; of another size it is taken to show the same field of view.
+    let intrinsics = intrinsics(&mut keys, size_px, rectified).unwrap_or_else(|| Intrinsics {
+        rectified,
+        ..if size_px == color.size_px { color.clone() } else { color.resized(size_px) }
+    });
+    let min_m = keys.number("min_m", 0.0..=100.0).unwrap_or(0.1);
+    let depth = Depth {
+        intrinsics,
+        camera_from_depth: pose(&mut keys, "camera_from_depth").unwrap_or_else(Transform::identity),
+        min_m,
+        max_m: keys.number("max_m", min_m..=1000.0).unwrap_or(6.0),
+    };
+    keys.end();
+    depth
+}
+
+fn camera_sim(mut keys: Section<'_>) -> CameraSim {
+    let sim = CameraSim {
+        noise_sigma: keys.number("noise_sigma", 0.0..=100.0).unwrap_or(2.0),
+        shot_frac: keys.number("shot_frac", 0.0..=1.0).unwrap_or(0.7),
+        blur_samples: keys.whole("blur_samples", 1..=64).map_or(1, small),
+        latency_millis: keys.number("latency_millis", 0.0..=10_000.0).unwrap_or(20.0),
+        dropped_frac: keys.number("dropped_frac", 0.0..=0.9).unwrap_or(0.0),
+        supersample: keys.whole("supersample", 1..=4).map_or(1, small),
+        depth_noise_sigma_m: keys.number("depth_noise_sigma_m", 0.0..=1.0).unwrap_or(0.0015),
+        depth_hole_frac: keys.number("depth_hole_frac", 0.0..=0.9).unwrap_or(0.02),
+        metres_per_count: keys.number("metres_per_count", 1e-6..=0.1).unwrap_or(1e-4),
+    };
+    keys.end();
+    sim
+}
+
+fn join(mut keys: Section<'_>) -> JoinConfig {
+    let join = JoinConfig {
+        start_keyframes: keys.whole("start_keyframes", 1..=100_000).map_or(5, count),
+        max_keyframes: keys.whole("max_keyframes", 8..=1_000_000).map_or(400, count),
+        max_bytes: keys.whole("max_bytes", 1_000_000..=1 << 50).unwrap_or(4_000_000_000),
+        min_translation_m: keys.number("min_translation_m", 1e-6..=100.0).unwrap_or(0.02),
+        min_rotation_rad: keys.number("min_rotation_rad", 1e-6..=3.2).unwrap_or(0.05),
+        fixed_interval_millis: keys.number("fixed_interval_millis", 0.0..=1e9).unwrap_or(1000.0),
+        fixed_keyframes: keys.whole("fixed_keyframes", 1..=1_000_000).map_or(16, count),
+        min_sharpness_frac: keys.number("min_sharpness_frac", 0.0..=1.0).unwrap_or(0.4),
+        max_blur_px: keys.number("max_blur_px", 0.0..=1000.0).unwrap_or(1.5),
+        max_shear_px: keys.number("max_shear_px", 0.0..=1000.0).unwrap_or(40.0),
+        min_luma_frac: keys.number("min_luma_frac", 0.0..=1.0).unwrap_or(0.03),
+        max_luma_frac: keys.number("max_luma_frac", 0.0..=1.0).unwrap_or(0.97),
+        max_clipped_frac: keys.number("max_clipped_frac", 0.0..=1.0).unwrap_or(0.5),
+        default_depth_m: keys.number("default_depth_m", 0.01..=1000.0).unwrap_or(0.5),
+        max_gap_millis: keys.number("max_gap_millis", 0.1..=10_000.0).unwrap_or(50.0),
+        max_wait_millis: keys.number("max_wait_millis", 1.0..=60_000.0).unwrap_or(500.0),
+    };
+    keys.end();
+    join
+}
+
+fn train(mut keys: Section<'_>) -> Train {
+    let train = Train {
+        method: keys.choice("method", &METHODS).unwrap_or("splat").to_owned(),
+        max_splats: keys.whole("max_splats", 1..=100_000_000),
+        max_bytes: keys.whole("max_bytes", 1_000_000..=1 << 50),
+        seed: keys.whole("seed", 0..=i64::MAX.cast_unsigned()).unwrap_or(1),
+        sh_degree: keys.whole("sh_degree", 0..=3).map_or(3, small),
+        scale: keys.number("scale", 0.05..=1.0).unwrap_or(1.0),
+    };
+    keys.end();
+    train
+}
+
+fn sim(mut keys: Section<'_>) -> Sim {
+    let sim = Sim {
+        scene: keys.text("scene").unwrap_or_else(|| "static-arm".to_owned()),
+        seed: keys.whole("seed", 0..=i64::MAX.cast_unsigned()).unwrap_or(1),
+        ideal: keys.flag("ideal").unwrap_or(false),
+        lockstep: keys.flag("lockstep").unwrap_or(false),
+        speed: keys.number("speed", 0.01..=2.0).unwrap_or(1.0),
+        duration_secs: keys.number("duration_secs", 0.001..=1e6),
+        n_images: keys.whole("n_images", 1..=1_000_000_000),
+        truth: keys.flag("truth").unwrap_or(true),
+        truth_depth: keys.flag("truth_depth").unwrap_or(false),
+    };
+    keys.end();
+    sim
+}
+
+fn pose(keys: &mut Section<'_>, key: &'static str) -> Option<Transform> {
+    let mut keys = keys.optional_section(key)?;
+    let [x, y, z] = keys.numbers::<3>("xyz_m", -FAR..=FAR).unwrap_or_default();
+    let [i, j, k, w] = keys.numbers::<4>("quat_xyzw", -1.001..=1.001).unwrap_or([0.0, 0.0, 0.0, 1.0]);
+    let quaternion = Quaternion::new(w, i, j, k);
+    let norm = quaternion.norm();
+    if (norm - 1.0).abs() > 1e-3 {
+        keys.wrong::<()>("quat_xyzw", &Value::from(vec![i, j, k, w]), "numbers whose squares sum to 1");
+    }
+    keys.end();
+    let rotation = match (norm - 1.0).abs() < UNIT_CLOSE {
+        true => UnitQuaternion::new_unchecked(quaternion),
+        false => UnitQuaternion::new_normalize(quaternion),
+    };
+    Some(Transform::from_parts(Translation3::new(x, y, z), rotation))
+}
+
+fn small(number: u64) -> u32 {
+    u32::try_from(number).expect("the range was checked")
+}
+
+fn count(number: u64) -> usize {
+    usize::try_from(number).expect("the range was checked")
+}

@@ -1,0 +1,267 @@
+//! Reads the keys of a TOML table one by one, checked; what was never asked for is an unknown key.
+//!
+//! Problems are collected, so that a misspelt key is told as such and not as a missing one.
+
+use super::error::{ConfigError, Place};
+use std::cell::RefCell;
+use std::collections::{BTreeMap, BTreeSet};
+use std::ops::RangeInclusive;
+use toml::de::{DeTable, DeValue};
+use toml::{Table, Value};
+
+/// What is known about the rig file while it is read.
+#[derive(Debug)]
+pub(super) struct Reading {
+    file: String,
+    /// Line of every key in the file, by dotted path.
+    lines: BTreeMap<String, usize>,
+    flags: BTreeSet<String>,
+    problems: RefCell<Vec<ConfigError>>,
+    /// Every key asked for, by dotted path with `NAME` for a camera's name.
+    asked: RefCell<BTreeSet<String>>,
+}
+
+impl Reading {
+    /// Notes the lines of all keys; fails when the text is not TOML.
+    pub(super) fn new(file: &str, text: &str, flags: BTreeSet<String>) -> Result<Self, ConfigError> {
+        let mut lines = BTreeMap::new();
+        let table = DeTable::parse(text).map_err(|e| ConfigError::Syntax {
+            file: file.to_owned(),
+            line: line_of(text, e.span().map_or(0, |span| span.start)),
+            message: e.message().to_owned(),
+        })?;
+        note_lines(text, table.get_ref(), "", &mut lines);
+        Ok(Self { file: file.to_owned(), lines, flags, problems: RefCell::default(), asked: RefCell::default() })
+    }
+
+    /// The problem to tell, if there is any: unknown keys first, for they explain missing ones.
+    pub(super) fn into_problem(self) -> Option<ConfigError> {
+        let mut problems = self.problems.into_inner();
+        let first = problems.iter().position(|problem| matches!(problem, ConfigError::UnknownKey { .. })).unwrap_or(0);
+        (!problems.is_empty()).then(|| problems.swap_remove(first))
+    }
+
+    /// Every key asked for so far.
+    #[cfg(test)]
+    pub(super) fn asked(&self) -> BTreeSet<String> {
+        self.asked.borrow().clone()
+    }
+
+    fn tell(&self, problem: ConfigError) {
+        self.problems.borrow_mut().push(problem);
+    }
+
+    fn place(&self, key: &str) -> Place {
+        // A flag may replace a whole table, and a key inside an inline table is where that table is.
+        let mut path = key;
+        loop {
+            if self.flags.contains(path) {
+                return Place::Flag;
+            }
+            if let Some(line) = self.lines.get(path) {
+                return Place::Line { file: self.file.clone(), line: *line };
+            }
+            match path.rsplit_once('.') {
+                Some((parent, _)) => path = parent,
+                None => return Place::Line { file: self.file.clone(), line: 1 },
+            }
+        }
+    }
+}
+
+fn note_lines(text: &str, table: &DeTable<'_>, path: &str, lines: &mut BTreeMap<String, usize>) {
+    for (key, value) in table {
+        let path = join(path, key.get_ref());
+        lines.insert(path.clone(), line_of(text, key.span().start));
+        if let DeValue::Table(inner) = value.get_ref() {
+            note_lines(text, inner, &path, lines);
+        }
+    }
+}
+
+fn line_of(text: &str, offset: usize) -> usize {
+    text.bytes().take(offset).filter(|byte| *byte == b'\n').count() + 1
+}
+
+fn join(path: &str, key: &str) -> String {
+    if path.is_empty() { key.to_owned() } else { format!("{path}.{key}") }
+}
+
+/// One table of the rig file while its keys are read.
+#[derive(Debug)]
+pub(super) struct Section<'a> {
+    reading: &'a Reading,
+    /// Dotted path, as in the file and as in the documentation.
+    path: String,
+    documented_path: String,
+    table: Table,
+    known: Vec<&'static str>,
+}
+
+impl<'a> Section<'a> {
+    /// The whole file.
+    pub(super) fn root(reading: &'a Reading, table: Table) -> Self {
+        Self { reading, path: String::new(), documented_path: String::new(), table, known: Vec::new() }
+    }
+
+    /// Ends the section: keys that nobody asked for are unknown.
+    pub(super) fn end(self) {
+        for key in self.table.keys() {
+            let close = |known: &&&str| (strsim::jaro_winkler(key, known) * 1000.0).round();
+            let nearest = self.known.iter().max_by(|a, b| close(a).total_cmp(&close(b)));
+            let nearest = nearest.filter(|known| strsim::jaro_winkler(key, known) > 0.7);
+            let path = join(&self.path, key);
+            self.reading.tell(ConfigError::UnknownKey {
+                at: self.reading.place(&path),
+                key: path,
+                nearest: nearest.map(|known| join(&self.path, known)),
+            });
+        }
+    }
+
+    /// A table inside this one; an absent one reads as empty.
+    pub(super) fn section(&mut self, key: &'static str) -> Self {
+        self.optional_section(key).unwrap_or_else(|| self.inner(key, key, Table::new()))
+    }
+
+    /// A table inside this one, if it is there.
+    pub(super) fn optional_section(&mut self, key: &'static str) -> Option<Self> {
+        self.known.push(key);
+        match self.table.remove(key)? {
+            Value::Table(table) => Some(self.inner(key, key, table)),
+            other => self.wrong(key, &other, "a table"),
+        }
+    }
+
+    /// The tables inside this one whose names are free, by name.
+    pub(super) fn named_sections(&mut self, key: &'static str) -> Vec<(String, Self)> {
+        let Some(mut parent) = self.optional_section(key) else { return Vec::new() };
+        let mut sections = Vec::new();
+        for (name, value) in std::mem::take(&mut parent.table) {
+            match value {
+                Value::Table(table) => sections.push((name.clone(), parent.inner(&name, "NAME", table))),
+                other => parent.wrong(&name, &other, "a table").unwrap_or_default(),
+            }
+        }
+        sections
+    }
+
+    fn inner(&self, key: &str, documented: &str, table: Table) -> Self {
+        Section {
+            reading: self.reading,
+            path: join(&self.path, key),
+            documented_path: join(&self.documented_path, documented),
+            table,
+            known: Vec::new(),
+        }
+    }
+
+    /// A number within a range, if the key is there.
+    pub(super) fn number(&mut self, key: &'static str, range: RangeInclusive<f64>) -> Option<f64> {
+        let value = self.take(key)?;
+        match as_number(&value).filter(|number| range.contains(number)) {
+            Some(number) => Some(number),
+            None => self.wrong(key, &value, &format!("{} to {}", range.start(), range.end())),
+        }
+    }
+
+    /// A whole number within a range, if the key is there.
+    pub(super) fn whole(&mut self, key: &'static str, range: RangeInclusive<u64>) -> Option<u64> {
+        let value = self.take(key)?;
+        match value.as_integer().and_then(|number| u64::try_from(number).ok()).filter(|number| range.contains(number)) {
+            Some(number) => Some(number),
+            None => self.wrong(key, &value, &format!("whole numbers from {} to {}", range.start(), range.end())),
+        }
+    }
+
+    /// `true` or `false`, if the key is there.
+    pub(super) fn flag(&mut self, key: &'static str) -> Option<bool> {
+        let value = self.take(key)?;
+        value.as_bool().or_else(|| self.wrong(key, &value, "true or false"))
+    }
+
+    /// Text, if the key is there.
+    pub(super) fn text(&mut self, key: &'static str) -> Option<String> {
+        match self.take(key)? {
+            Value::String(text) => Some(text),
+            other => self.wrong(key, &other, "text in quotes"),
+        }
+    }
+
+    /// A list of texts, if the key is there.
+    pub(super) fn texts(&mut self, key: &'static str) -> Option<Vec<String>> {
+        let value = self.take(key)?;
+        let texts =
+            value.as_array().and_then(|list| list.iter().map(|text| text.as_str().map(str::to_owned)).collect());
+        texts.or_else(|| self.wrong(key, &value, "a list of texts in quotes"))
+    }
+
+    /// Exactly `N` numbers within a range, if the key is there.
+    pub(super) fn numbers<const N: usize>(
+        &mut self,
+        key: &'static str,
+        range: RangeInclusive<f64>,
+    ) -> Option<[f64; N]> {
+        let value = self.take(key)?;
+        let numbers: Option<Vec<f64>> = value
+            .as_array()
+            .and_then(|list| list.iter().map(|item| as_number(item).filter(|n| range.contains(n))).collect());
+        match numbers.and_then(|numbers| <[f64; N]>::try_from(numbers).ok()) {
+            Some(numbers) => Some(numbers),
+            None => self.wrong(key, &value, &format!("{N} numbers from {} to {}", range.start(), range.end())),
+        }
+    }
+
+    /// Any count of numbers, if the key is there.
+    pub(super) fn number_list(&mut self, key: &'static str) -> Option<Vec<f64>> {
+        let value = self.take(key)?;
+        let numbers = value.as_array().and_then(|list| list.iter().map(as_number).collect());
+        numbers.or_else(|| self.wrong(key, &value, "a list of numbers"))
+    }
+
+    /// One of a few words, if the key is there.
+    pub(super) fn choice<T: Copy>(&mut self, key: &'static str, choices: &[(&str, T)]) -> Option<T> {
+        let value = self.take(key)?;
+        let found = choices.iter().find(|(name, _)| value.as_str() == Some(name));
+        if found.is_none() {
+            let names: Vec<_> = choices.iter().map(|(name, _)| format!("{name:?}")).collect();
+            return self.wrong(key, &value, &names.join(", "));
+        }
+        found.map(|(_, choice)| *choice)
+    }
+
+    /// Says that a needed key is absent, unless its value was just found wrong.
+    pub(super) fn missing(&self, key: &str, meaning: &'static str) {
+        let key = join(&self.path, key);
+        let told = |problem: &ConfigError| matches!(problem, ConfigError::Wrong { key: wrong, .. } if *wrong == key);
+        if !self.reading.problems.borrow().iter().any(told) {
+            self.reading.tell(ConfigError::Missing { file: self.reading.file.clone(), key, meaning });
+        }
+    }
+
+    /// Says that the value of a key is not allowed.
+    pub(super) fn wrong<T>(&self, key: &str, got: &Value, allowed: &str) -> Option<T> {
+        let key = join(&self.path, key);
+        let at = self.reading.place(&key);
+        self.reading.tell(ConfigError::Wrong {
+            at,
+            key,
+            got: got.to_string().trim().to_owned(),
+            allowed: allowed.to_owned(),
+        });
+        None
+    }
+
+    fn take(&mut self, key: &'static str) -> Option<Value> {
+        self.known.push(key);
+        self.reading.asked.borrow_mut().insert(join(&self.documented_path, key));
+        self.table.remove(key)
+    }
+}
+
+/// Whole numbers count as numbers; NaN and infinity do not.
+fn as_number(value: &Value) -> Option<f64> {
+    #[expect(clippy::cast_precision_loss, reason = "numbers of a rig file stay far below 2^53")]
+    let number = value.as_float().or_else(|| value.as_integer().map(|whole| whole as f64))?;
+    number.is_finite().then_some(number)
+}

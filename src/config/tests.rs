@@ -1,0 +1,283 @@
+//! Every key of the rig file: documented, effective, checked; and the file that comes back gives the same rig.
+
+use super::{ConfigError, Override, Rig, read};
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+use toml::Value;
+
+const URDF: &str = r#"<robot name="two"><link name="a"/><link name="b"/><link name="c"/><link name="tool"/>
+<joint name="j1" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
+<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+<joint name="j2" type="revolute"><parent link="b"/><child link="c"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+<joint name="fix" type="fixed"><parent link="c"/><child link="tool"/></joint></robot>"#;
+
+/// A rig file that has every table, so that each key can be changed by itself.
+const RIG: &str = r#"
+[arm]
+driver = "sim"
+urdf = "two.urdf"
+flange_link = "c"
+[camera.wrist]
+driver = "v4l2"
+size_px = [640, 480]
+rate_hz = 30
+parent = "flange"
+parent_from_camera = { xyz_m = [0.0, 0.0, 0.1], quat_xyzw = [0.0, 0.0, 0.0, 1.0] }
+stamp_to_mid_exposure_millis = { value = -1.0, sigma = 0.5, source = "by hand" }
+intrinsics = { focal_px = [600, 600], principal_px = [320.0, 240.0], lens = "brown_conrady", distortion = [0.1, 0, 0, 0, 0] }
+[camera.wrist.depth]
+size_px = [320, 240]
+intrinsics = { focal_px = [300, 300], principal_px = [160.0, 120.0], lens = "brown_conrady", distortion = [0.1, 0, 0, 0, 0] }
+[camera.wrist.sim]
+[base]
+[join]
+[train]
+[sim]
+"#;
+
+fn parse(text: &str, overrides: &[Override]) -> Result<Rig, ConfigError> {
+    Rig::parse("rig.toml", text, URDF, overrides)
+}
+
+fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
+    let value: toml::Table = toml::from_str(&format!("value = {value}")).expect("a TOML value");
+    parse(RIG, &[Override::new(key, value["value"].clone())])
+}
+
+/// Key, a good value that differs from the one in force, and a value that is not allowed.
+const KEYS: [(&str, &str, &str); 82] = [
+    ("arm.driver", "'franka'", "'frankka'"),
+    ("arm.address", "'172.16.0.2'", "7"),
+    ("arm.urdf", "'other.urdf'", "7"),
+    ("arm.joints", "['j2', 'j1']", "['j1', 'j9']"),
+    ("arm.base_link", "'b'", "'nowhere'"),
+    ("arm.flange_link", "'tool'", "'nowhere'"),
+    ("arm.max_speed_rad_s", "0.25", "-1"),
+    ("base.driver", "'tags'", "'floating'"),
+    ("base.world_from_base.xyz_m", "[1, 0, 0]", "[1, 0]"),
+    ("base.world_from_base.quat_xyzw", "[1, 0, 0, 0]", "[1, 1, 0, 0]"),
+    ("camera.wrist.driver", "'realsense'", "'webcam'"),
+    ("camera.wrist.device", "'/dev/video7'", "7"),
+    ("camera.wrist.size_px", "[800, 600]", "[640, 480.5]"),
+    ("camera.wrist.rate_hz", "15", "0"),
+    ("camera.wrist.exposure_micros", "4000", "40_000"),
+    ("camera.wrist.readout_micros", "15000", "-1"),
+    ("camera.wrist.stamp_to_mid_exposure_millis.value", "-12.4", "'late'"),
+    ("camera.wrist.stamp_to_mid_exposure_millis.sigma", "0.6", "-0.6"),
+    ("camera.wrist.stamp_to_mid_exposure_millis.source", "'calibrate'", "1"),
+    ("camera.wrist.parent", "'base'", "'tool'"),
+    ("camera.wrist.parent_from_camera.xyz_m", "[0, 0, 0.2]", "[0, 0, inf]"),
+    ("camera.wrist.parent_from_camera.quat_xyzw", "[0, 1, 0, 0]", "[0, 0, 0, 0]"),
+    ("camera.wrist.intrinsics.focal_px", "[500, 501]", "[0, 500]"),
+    ("camera.wrist.intrinsics.principal_px", "[321, 241]", "[nan, 240]"),
+    ("camera.wrist.intrinsics.lens", "'pinhole'", "'fisheye'"),
+    ("camera.wrist.intrinsics.distortion", "[0, 0, 0, 0, 0.1]", "[0.1]"),
+    ("camera.wrist.rectified", "true", "1"),
+    ("camera.wrist.depth.size_px", "[640, 480]", "[4, 4]"),
+    ("camera.wrist.depth.intrinsics.focal_px", "[301, 300]", "[300]"),
+    ("camera.wrist.depth.intrinsics.principal_px", "[161, 120]", "160"),
+    ("camera.wrist.depth.intrinsics.lens", "'pinhole'", "'thin'"),
+    ("camera.wrist.depth.intrinsics.distortion", "[0, 0, 0, 0, 0.1]", "[0, 0]"),
+    ("camera.wrist.depth.rectified", "true", "'yes'"),
+    ("camera.wrist.depth.camera_from_depth.xyz_m", "[0.01, 0, 0]", "[]"),
+    ("camera.wrist.depth.camera_from_depth.quat_xyzw", "[0, 1, 0, 0]", "[2, 0, 0, 0]"),
+    ("camera.wrist.depth.min_m", "0.2", "-0.2"),
+    ("camera.wrist.depth.max_m", "3", "0.05"),
+    ("camera.wrist.sim.noise_sigma", "1", "-1"),
+    ("camera.wrist.sim.shot_frac", "0.5", "1.5"),
+    ("camera.wrist.sim.blur_samples", "4", "0"),
+    ("camera.wrist.sim.latency_millis", "30", "-1"),
+    ("camera.wrist.sim.dropped_frac", "0.1", "1"),
+    ("camera.wrist.sim.supersample", "2", "2.5"),
+    ("camera.wrist.sim.depth_noise_sigma_m", "0.01", "2"),
+    ("camera.wrist.sim.depth_hole_frac", "0.1", "1"),
+    ("camera.wrist.sim.metres_per_count", "0.001", "0"),
+    ("join.start_keyframes", "8", "0"),
+    ("join.max_keyframes", "50", "7"),
+    ("join.max_bytes", "50_000_000", "-5"),
+    ("join.min_translation_m", "0.05", "0"),
+    ("join.min_rotation_rad", "0.1", "4"),
+    ("join.fixed_interval_millis", "500", "-1"),
+    ("join.fixed_keyframes", "8", "0"),
+    ("join.min_sharpness_frac", "0.2", "1.2"),
+    ("join.max_blur_px", "3", "-3"),
+    ("join.max_shear_px", "10", "'ten'"),
+    ("join.min_luma_frac", "0.1", "-0.1"),
+    ("join.max_luma_frac", "0.9", "1.1"),
+    ("join.max_clipped_frac", "0.2", "2"),
+    ("join.default_depth_m", "2", "0"),
+    ("join.max_gap_millis", "20", "0"),
+    ("join.max_wait_millis", "100", "0"),
+    ("train.method", "'tsdf'", "'mesh'"),
+    ("train.max_splats", "1_500_000", "0"),
+    ("train.max_bytes", "100_000_000", "1"),
+    ("train.seed", "7", "-7"),
+    ("train.sh_degree", "2", "4"),
+    ("train.scale", "0.5", "0"),
+    ("sim.scene", "'mobile-arm'", "1"),
+    ("sim.seed", "3", "0.5"),
+    ("sim.ideal", "true", "'yes'"),
+    ("sim.lockstep", "true", "1"),
+    ("sim.speed", "0.5", "3"),
+    ("sim.duration_secs", "60", "0"),
+    ("sim.n_images", "300", "0"),
+    ("sim.truth", "false", "0"),
+    ("sim.truth_depth", "true", "0"),
+    // The same keys by the names of whole tables: a flag may replace a table too.
+    ("base.world_from_base", "{ xyz_m = [1, 2, 3] }", "3"),
+    ("camera.wrist.stamp_to_mid_exposure_millis", "{ value = 2 }", "2"),
+    ("camera.wrist.parent_from_camera", "{ xyz_m = [1, 2, 3] }", "[1, 2, 3]"),
+    ("camera.wrist.depth", "{ min_m = 0.3 }", "true"),
+    ("camera.wrist.intrinsics", "{ focal_px = [500, 500], principal_px = [1, 1] }", "'narrow'"),
+];
+
+#[test]
+fn every_key_takes_effect_and_refuses_what_is_not_allowed() {
+    let rig = parse(RIG, &[]).expect("a good rig file");
+    let mut wrong = Vec::new();
+    for (key, good, bad) in KEYS {
+        match with(key, good) {
+            // The path of the robot's description is read, not kept.
+            Ok(changed) if changed == rig && key != "arm.urdf" => wrong.push(format!("{key} = {good} changes nothing")),
+            Ok(_) => {}
+            Err(e) => wrong.push(format!("{key} = {good} is refused: {e}")),
+        }
+        match with(key, bad) {
+            Ok(_) => wrong.push(format!("{key} = {bad} is accepted")),
+            Err(e) if !names(&e.to_string(), key) => {
+                wrong.push(format!("{key} = {bad}: the message does not name it: {e}"))
+            }
+            Err(_) => {}
+        }
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// Whether a message names the key; links are told by the key that asked for them.
+fn names(message: &str, key: &str) -> bool {
+    message.contains(key)
+        || (key == "arm.base_link" && message.contains("arm.flange_link") && message.contains("nowhere"))
+}
+
+#[test]
+fn the_settled_file_gives_the_same_rig() {
+    for (key, good, _) in KEYS {
+        let rig = with(key, good).expect("a good value");
+        let again = parse(&rig.to_toml(), &[]).unwrap_or_else(|e| panic!("{key}: {e}\n{}", rig.to_toml()));
+        assert_eq!(again, rig, "{key}");
+        assert_eq!(again.to_toml(), rig.to_toml(), "{key}");
+    }
+}
+
+#[test]
+fn the_documentation_lists_exactly_the_keys_there_are() {
+    let page = include_str!("../../docs/rig.md");
+    let documented: BTreeMap<String, &str> =
+        page.lines().filter_map(|line| Some((line.strip_prefix("| `")?.split_once('`')?.0.to_owned(), line))).collect();
+    let (_, _, reading) = read::keys("rig.toml", &full(), &[]).expect("TOML");
+    let known = reading.asked();
+    let listed: BTreeSet<String> = documented.keys().cloned().collect();
+    assert_eq!(listed.difference(&known).collect::<Vec<_>>(), Vec::<&String>::new(), "documented, but not read");
+    assert_eq!(known.difference(&listed).collect::<Vec<_>>(), Vec::<&String>::new(), "read, but not documented");
+    let tested: BTreeSet<String> = KEYS.iter().map(|(key, ..)| key.replace("camera.wrist", "camera.NAME")).collect();
+    assert_eq!(known.difference(&tested).collect::<Vec<_>>(), Vec::<&String>::new(), "read, but not tested above");
+    for (key, line) in documented {
+        let cells = line.split('|').filter(|cell| !cell.trim().is_empty()).count();
+        assert_eq!(cells, 4, "{key}: key, meaning, default, allowed");
+    }
+}
+
+/// A settled file: it has every table.
+fn full() -> String {
+    let measured = Override::new("base.world_from_base.xyz_m", Value::from(vec![0.0; 3]));
+    parse(RIG, &[measured]).expect("a good rig file").to_toml()
+}
+
+#[test]
+fn the_defaults_of_the_documentation_are_the_defaults() {
+    let page = include_str!("../../docs/rig.md");
+    let rig = parse(RIG, &[]).expect("a good rig file");
+    let settled: toml::Table = toml::from_str(&rig.to_toml()).expect("TOML");
+    let mut n_checked = 0;
+    for line in page.lines().filter(|line| line.starts_with("| `join.") || line.starts_with("| `camera.NAME.sim.")) {
+        let cells: Vec<&str> = line.split('|').map(str::trim).collect();
+        let key = cells[1].trim_matches('`').replace("NAME", "wrist");
+        let value = key.split('.').fold(&Value::Table(settled.clone()), |table, part| &table[part]).clone();
+        let number = value.as_float().or_else(|| value.as_integer().map(|whole| whole as f64)).expect("a number");
+        assert_eq!(cells[3].parse::<f64>().expect("a number in the documentation"), number, "{key}");
+        n_checked += 1;
+    }
+    assert_eq!(n_checked, 25, "[join] and [camera.NAME.sim]");
+}
+
+#[test]
+fn an_unknown_key_is_named_with_its_line_and_the_nearest_known_key() {
+    let cases = [
+        ("flange_lnk = \"c\"", "flange_link = \"c\"", 5, "arm.flange_lnk", Some("arm.flange_link")),
+        ("rate_herz = 30", "rate_hz = 30", 9, "camera.wrist.rate_herz", Some("camera.wrist.rate_hz")),
+        ("[trian]", "[train]", 20, "trian", Some("train")),
+        (
+            "quat_xyz =",
+            "quat_xyzw =",
+            11,
+            "camera.wrist.parent_from_camera.quat_xyz",
+            Some("camera.wrist.parent_from_camera.quat_xyzw"),
+        ),
+        ("[sim]\nzebra = 1", "[sim]", 22, "sim.zebra", None),
+    ];
+    for (wrong, right, expected_line, expected_key, expected_nearest) in cases {
+        let error = parse(&RIG.replacen(right, wrong, 1), &[]).expect_err(wrong);
+        let message = error.to_string();
+        match error {
+            ConfigError::UnknownKey { key, nearest, .. } => {
+                assert_eq!((key.as_str(), nearest.as_deref()), (expected_key, expected_nearest), "{message}");
+            }
+            other => panic!("{wrong}: {other}"),
+        }
+        assert!(message.starts_with(&format!("rig.toml line {expected_line}: ")), "{message}");
+    }
+}
+
+#[test]
+fn missing_keys_and_broken_text_are_told() {
+    for key in ["driver", "urdf", "flange_link", "size_px", "rate_hz", "parent"] {
+        let without: String =
+            RIG.lines().filter(|line| !line.starts_with(&format!("{key} ="))).map(|line| format!("{line}\n")).collect();
+        let message = parse(&without, &[]).expect_err(key).to_string();
+        assert!(message.contains("is missing") && message.contains(key), "{message}");
+    }
+    let message = parse("[arm]\ndriver = \"sim\nurdf = 3", &[]).expect_err("no closing quote").to_string();
+    assert!(message.starts_with("rig.toml line 2: "), "{message}");
+    let message =
+        parse("[arm]\ndriver = \"sim\"\nurdf = \"u\"\nflange_link = \"c\"\n", &[]).expect_err("no camera").to_string();
+    assert!(message.contains("[camera.NAME]"), "{message}");
+    let missing = Rig::load(Path::new("no/such/rig.toml"), &[]).expect_err("no file").to_string();
+    assert!(missing.contains("no/such/rig.toml"), "{missing}");
+}
+
+#[test]
+fn wrong_values_name_their_line_or_the_flag() {
+    let message = parse(&RIG.replace("rate_hz = 30", "rate_hz = 3000"), &[]).expect_err("too fast").to_string();
+    assert_eq!(message, "rig.toml line 9: camera.wrist.rate_hz is 3000, allowed: 0.01 to 1000");
+    let message = parse(RIG, &[Override::new("train.sh_degree", 9)]).expect_err("no such degree").to_string();
+    assert_eq!(message, "command line: train.sh_degree is 9, allowed: whole numbers from 0 to 3");
+}
+
+#[test]
+fn the_rig_files_that_come_along_are_good_and_settle() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
+    let mut n_rigs = 0;
+    for entry in std::fs::read_dir(&folder).expect("the folder rigs") {
+        let path = entry.expect("a file").path();
+        if path.extension().is_none_or(|ending| ending != "toml") {
+            continue;
+        }
+        n_rigs += 1;
+        let rig = Rig::load(&path, &[]).unwrap_or_else(|e| panic!("{e}"));
+        let settled = tempfile::tempdir().expect("a folder");
+        let again = Rig::load(&rig.write_settled(settled.path()).expect("room on the disk"), &[]);
+        assert_eq!(again.unwrap_or_else(|e| panic!("{e}")), rig, "{path:?}");
+    }
+    assert!(n_rigs >= 3, "{n_rigs} rig files");
+}

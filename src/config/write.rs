@@ -1,0 +1,176 @@
+//! The settled rig file: every key of a checked rig, written so that reading it gives the same rig.
+
+use super::read::{ARM_DRIVERS, BASE_DRIVERS, CAMERA_DRIVERS, PARENTS};
+use super::{Arm, Base, Camera, CameraSim, Depth, JoinConfig, Rig, Sim, Train};
+use kinematics::{Intrinsics, Lens, Transform};
+use toml::{Table, Value};
+
+pub(super) fn rig(rig: &Rig) -> String {
+    let cameras =
+        rig.cameras.iter().map(|camera| (camera.name.to_string(), Value::Table(self::camera(camera)))).collect();
+    let file = table([
+        ("arm", Some(Value::Table(arm(&rig.arm)))),
+        ("base", Some(Value::Table(base(&rig.base)))),
+        ("camera", Some(Value::Table(cameras))),
+        ("join", Some(Value::Table(join(&rig.join)))),
+        ("train", Some(Value::Table(train(&rig.train)))),
+        ("sim", Some(Value::Table(sim(&rig.sim)))),
+    ]);
+    toml::to_string(&file).expect("tables of numbers and texts always serialize")
+}
+
+/// A table of the keys that have a value.
+fn table<const N: usize>(entries: [(&str, Option<Value>); N]) -> Table {
+    entries.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))).collect()
+}
+
+fn is(value: impl Into<Value>) -> Option<Value> {
+    Some(value.into())
+}
+
+fn whole(number: u64) -> Option<Value> {
+    // Larger numbers cannot come from a rig file.
+    is(i64::try_from(number).unwrap_or(i64::MAX))
+}
+
+fn name_of<T: PartialEq>(choices: &[(&'static str, T)], choice: &T) -> Option<Value> {
+    choices.iter().find(|(_, candidate)| candidate == choice).map(|(name, _)| Value::from(*name))
+}
+
+fn arm(arm: &Arm) -> Table {
+    table([
+        ("driver", name_of(&ARM_DRIVERS, &arm.driver)),
+        ("address", is(arm.address.as_str())),
+        ("urdf", is(drivers::recording::URDF_FILE)),
+        ("joints", is(arm.joints.clone())),
+        ("base_link", is(arm.base_link.as_str())),
+        ("flange_link", is(arm.flange_link.as_str())),
+        ("max_speed_rad_s", is(arm.max_speed_rad_s)),
+    ])
+}
+
+fn base(base: &Base) -> Table {
+    table([("driver", name_of(&BASE_DRIVERS, &base.driver)), ("world_from_base", pose(&base.world_from_base))])
+}
+
+fn camera(camera: &Camera) -> Table {
+    let measured = camera.stamp_to_mid_exposure.as_ref().map(|measured| {
+        Value::Table(table([
+            ("value", is(measured.value_millis)),
+            ("sigma", is(measured.sigma_millis)),
+            ("source", is(measured.source.as_str())),
+        ]))
+    });
+    table([
+        ("driver", name_of(&CAMERA_DRIVERS, &camera.driver)),
+        ("device", is(camera.device.as_str())),
+        ("size_px", size_px(camera.intrinsics.size_px)),
+        ("rate_hz", is(camera.rate_hz)),
+        ("exposure_micros", camera.exposure_micros.map(Value::from)),
+        ("readout_micros", camera.readout_micros.map(Value::from)),
+        ("stamp_to_mid_exposure_millis", measured),
+        ("parent", name_of(&PARENTS, &camera.parent)),
+        ("parent_from_camera", pose(&camera.parent_from_camera)),
+        ("intrinsics", intrinsics(&camera.intrinsics)),
+        ("rectified", is(camera.intrinsics.rectified)),
+        ("depth", camera.depth.as_ref().map(|depth| Value::Table(self::depth(depth)))),
+        ("sim", Some(Value::Table(camera_sim(&camera.sim)))),
+    ])
+}
+
+fn depth(depth: &Depth) -> Table {
+    table([
+        ("size_px", size_px(depth.intrinsics.size_px)),
+        ("intrinsics", intrinsics(&depth.intrinsics)),
+        ("rectified", is(depth.intrinsics.rectified)),
+        ("camera_from_depth", pose(&depth.camera_from_depth)),
+        ("min_m", is(depth.min_m)),
+        ("max_m", is(depth.max_m)),
+    ])
+}
+
+fn camera_sim(sim: &CameraSim) -> Table {
+    table([
+        ("noise_sigma", is(sim.noise_sigma)),
+        ("shot_frac", is(sim.shot_frac)),
+        ("blur_samples", whole(sim.blur_samples.into())),
+        ("latency_millis", is(sim.latency_millis)),
+        ("dropped_frac", is(sim.dropped_frac)),
+        ("supersample", whole(sim.supersample.into())),
+        ("depth_noise_sigma_m", is(sim.depth_noise_sigma_m)),
+        ("depth_hole_frac", is(sim.depth_hole_frac)),
+        ("metres_per_count", is(sim.metres_per_count)),
+    ])
+}
+
+fn join(join: &JoinConfig) -> Table {
+    table([
+        ("start_keyframes", whole(join.start_keyframes as u64)),
+        ("max_keyframes", whole(join.max_keyframes as u64)),
+        ("max_bytes", whole(join.max_bytes)),
+        ("min_translation_m", is(join.min_translation_m)),
+        ("min_rotation_rad", is(join.min_rotation_rad)),
+        ("fixed_interval_millis", is(join.fixed_interval_millis)),
+        ("fixed_keyframes", whole(join.fixed_keyframes as u64)),
+        ("min_sharpness_frac", is(join.min_sharpness_frac)),
+        ("max_blur_px", is(join.max_blur_px)),
+        ("max_shear_px", is(join.max_shear_px)),
+        ("min_luma_frac", is(join.min_luma_frac)),
+        ("max_luma_frac", is(join.max_luma_frac)),
+        ("max_clipped_frac", is(join.max_clipped_frac)),
+        ("default_depth_m", is(join.default_depth_m)),
+        ("max_gap_millis", is(join.max_gap_millis)),
+        ("max_wait_millis", is(join.max_wait_millis)),
+    ])
+}
+
+fn train(train: &Train) -> Table {
+    table([
+        ("method", is(train.method.as_str())),
+        ("max_splats", train.max_splats.and_then(whole)),
+        ("max_bytes", train.max_bytes.and_then(whole)),
+        ("seed", whole(train.seed)),
+        ("sh_degree", whole(train.sh_degree.into())),
+        ("scale", is(train.scale)),
+    ])
+}
+
+fn sim(sim: &Sim) -> Table {
+    table([
+        ("scene", is(sim.scene.as_str())),
+        ("seed", whole(sim.seed)),
+        ("ideal", is(sim.ideal)),
+        ("lockstep", is(sim.lockstep)),
+        ("speed", is(sim.speed)),
+        ("duration_secs", sim.duration_secs.map(Value::from)),
+        ("n_images", sim.n_images.and_then(whole)),
+        ("truth", is(sim.truth)),
+        ("truth_depth", is(sim.truth_depth)),
+    ])
+}
+
+fn size_px([width, height]: [u32; 2]) -> Option<Value> {
+    is(vec![i64::from(width), i64::from(height)])
+}
+
+fn pose(pose: &Transform) -> Option<Value> {
+    let quaternion = pose.rotation.quaternion();
+    Some(Value::Table(table([
+        ("xyz_m", is(pose.translation.vector.iter().copied().collect::<Vec<_>>())),
+        ("quat_xyzw", is(vec![quaternion.i, quaternion.j, quaternion.k, quaternion.w])),
+    ])))
+}
+
+fn intrinsics(intrinsics: &Intrinsics) -> Option<Value> {
+    let (lens, distortion): (&str, &[f64]) = match &intrinsics.lens {
+        Lens::Pinhole => ("pinhole", &[]),
+        Lens::BrownConrady(k) => ("brown_conrady", k),
+        Lens::KannalaBrandt(k) => ("kannala_brandt", k),
+    };
+    Some(Value::Table(table([
+        ("focal_px", is(intrinsics.focal_px.to_vec())),
+        ("principal_px", is(intrinsics.principal_px.to_vec())),
+        ("lens", is(lens)),
+        ("distortion", is(distortion.to_vec())),
+    ])))
+}

@@ -1,0 +1,90 @@
+//! Which images of one camera are worth keeping.
+//!
+//! The tests go from cheap to dear: motion, then predicted blur and shear, then the pixels.
+
+use super::motion::{self, Posed};
+use super::pixels::{PixelFacts, SharpnessMemory};
+use super::refusal::Refusal;
+use super::spacing::Spacing;
+use crate::config::{self, JoinConfig, Parent};
+use kinematics::{Intrinsics, Stamp, Transform};
+
+/// The acceptance test of one camera.
+pub(super) struct Acceptance {
+    config: JoinConfig,
+    spacing: Spacing,
+    is_fixed: bool,
+    readout_secs: f64,
+    /// Every pose accepted so far, also of keyframes that were evicted since: else a full store would take the same
+    /// views again and again. The spacing bounds their number by the space that the camera can reach.
+    accepted: Vec<Transform>,
+    last: Option<Stamp>,
+    sharpness: SharpnessMemory,
+}
+
+impl Acceptance {
+    pub(super) fn new(config: &JoinConfig, camera: &config::Camera, spacing: Spacing) -> Self {
+        Self {
+            config: config.clone(),
+            spacing,
+            is_fixed: camera.parent != Parent::Flange,
+            readout_secs: camera.readout_micros.unwrap_or(0.0) * 1e-6,
+            accepted: Vec::new(),
+            last: None,
+            sharpness: SharpnessMemory::default(),
+        }
+    }
+
+    pub(super) fn readout_secs(&self) -> f64 {
+        self.readout_secs
+    }
+
+    /// Moved since the nearest keyframe? A camera that stands still is asked instead whether enough time has passed.
+    pub(super) fn judge_motion(&self, stamp: Stamp, pose: &Transform) -> Result<(), Refusal> {
+        let moved = if self.is_fixed {
+            let waited = self.last.is_none_or(|last| stamp.secs_since(last) * 1e3 >= self.config.fixed_interval_millis);
+            waited && self.accepted.len() < self.config.fixed_keyframes
+        } else {
+            self.accepted.iter().all(|accepted| self.spacing.between(accepted, pose) >= 1.0)
+        };
+        if moved { Ok(()) } else { Err(Refusal::NotMoved) }
+    }
+
+    /// Slow enough for its exposure and readout? `depth_m` is how far away the scene is.
+    pub(super) fn judge_speed(
+        &self,
+        posed: &Posed,
+        pinhole: &Intrinsics,
+        exposure_secs: Option<f64>,
+        depth_m: f64,
+    ) -> Result<(), Refusal> {
+        let Some(twist) = &posed.twist else {
+            return if self.readout_secs > 0.0 { Err(Refusal::ShearUnknown) } else { Ok(()) };
+        };
+        let speed_px_s = motion::image_speed_px_s(twist, pinhole, depth_m);
+        // Written so that a speed that is no number is refused.
+        let blur_px = speed_px_s * exposure_secs.unwrap_or(0.0);
+        if !(blur_px <= self.config.max_blur_px) {
+            return Err(Refusal::Blur);
+        }
+        let shear_px = speed_px_s * self.readout_secs;
+        if shear_px <= self.config.max_shear_px { Ok(()) } else { Err(Refusal::Shear) }
+    }
+
+    /// Well exposed and sharp? `rgb` is `[height, width, 3]`.
+    pub(super) fn judge_pixels(&mut self, rgb: &[u8], size_px: [u32; 2]) -> Result<(), Refusal> {
+        let facts = PixelFacts::of(rgb, size_px);
+        let lit = (self.config.min_luma_frac..=self.config.max_luma_frac).contains(&facts.luma_frac);
+        if !lit || facts.clipped_frac > self.config.max_clipped_frac {
+            return Err(Refusal::Exposure);
+        }
+        let relative = self.sharpness.relative(facts.sharpness);
+        if relative >= self.config.min_sharpness_frac { Ok(()) } else { Err(Refusal::NotSharp) }
+    }
+
+    /// Remembers a keyframe.
+    pub(super) fn accept(&mut self, stamp: Stamp, pose: &Transform) {
+        self.accepted.push(*pose);
+        self.last = Some(stamp);
+    }
+}

@@ -1,0 +1,102 @@
+//! From device images to the plain arrays of a keyframe: decoded, undistorted, depth in metres.
+
+use super::motion::Posed;
+use crate::config;
+use anyhow::Context;
+use drivers::{Image, TruthImage};
+use kinematics::{Intrinsics, Undistortion};
+use std::sync::Arc;
+use trainer::{DepthMap, Truth};
+
+/// How the images of one camera become pinhole images; computed once.
+pub(super) struct Lens {
+    pinhole: Intrinsics,
+    undistortion: Option<Undistortion>,
+}
+
+impl Lens {
+    pub(super) fn new(intrinsics: &Intrinsics) -> Self {
+        let undistortion = (!intrinsics.is_pinhole()).then(|| Undistortion::new(intrinsics));
+        Self { pinhole: intrinsics.undistorted(), undistortion }
+    }
+
+    /// The pinhole camera of the undistorted images.
+    pub(super) fn pinhole(&self) -> &Intrinsics {
+        &self.pinhole
+    }
+
+    /// `[height, width, 3]` to `[height, width, 4]`, undistorted; alpha tells what was seen.
+    pub(super) fn rgba(&self, rgb: &[u8]) -> anyhow::Result<Arc<[u8]>> {
+        match &self.undistortion {
+            Some(undistortion) => Ok(undistortion.apply_rgb(rgb)?.into()),
+            None => {
+                Ok(rgb.as_chunks::<3>().0.iter().flat_map(|[red, green, blue]| [*red, *green, *blue, 255]).collect())
+            }
+        }
+    }
+
+    fn depth_m(&self, depth_m: Vec<f32>) -> anyhow::Result<Vec<f32>> {
+        match &self.undistortion {
+            Some(undistortion) => Ok(undistortion.apply_depth(&depth_m)?),
+            None => Ok(depth_m),
+        }
+    }
+}
+
+/// Depth of a camera, decoded and undistorted; readings out of the sensor's range count as nothing seen.
+pub(super) fn depth_map(image: &Image, depth: &config::Depth, lens: &Lens, posed: &Posed) -> anyhow::Result<DepthMap> {
+    expect_size(image, &depth.intrinsics)?;
+    let mut depth_m = lens.depth_m(image.decode_depth_m()?)?;
+    #[expect(clippy::cast_possible_truncation, reason = "a range in metres needs no more digits")]
+    let (min_m, max_m) = (depth.min_m as f32, depth.max_m as f32);
+    for depth_m in &mut depth_m {
+        if !(min_m..=max_m).contains(depth_m) {
+            *depth_m = 0.0;
+        }
+    }
+    Ok(DepthMap {
+        size_px: lens.pinhole.size_px,
+        focal_px: lens.pinhole.focal_px,
+        principal_px: lens.pinhole.principal_px,
+        depth_m: depth_m.into(),
+        world_from_camera: posed.world_from_camera * depth.camera_from_depth,
+    })
+}
+
+/// Decodes a colour image to `[height, width, 3]` of the size that the rig file says.
+pub(super) fn rgb(image: &Image, intrinsics: &Intrinsics) -> anyhow::Result<Vec<u8>> {
+    expect_size(image, intrinsics)?;
+    Ok(image.decode_rgb()?)
+}
+
+/// What a simulator knows about a keyframe, in the same undistorted pixels.
+pub(super) fn truth(truth: &TruthImage, intrinsics: &Intrinsics, lens: &Lens) -> anyhow::Result<Truth> {
+    let rgba_srgb = lens.rgba(&rgb(&truth.image, intrinsics)?).context("the true image")?;
+    Ok(Truth { rgba_srgb, world_from_camera: truth.world_from_camera, psnr_ceiling: truth.psnr_ceiling })
+}
+
+/// Median of the readings of a depth map, every eighth of every eighth row; `None` when there is none.
+pub(super) fn median_depth_m(map: &DepthMap) -> Option<f64> {
+    let width = map.size_px[0] as usize;
+    let rows = map.depth_m.chunks(width.max(1)).step_by(8);
+    let mut seen: Vec<f32> =
+        rows.flat_map(|row| row.iter().step_by(8).copied()).filter(|depth_m| *depth_m > 0.0).collect();
+    if seen.is_empty() {
+        return None;
+    }
+    let middle = seen.len() / 2;
+    let (_, median, _) = seen.select_nth_unstable_by(middle, f32::total_cmp);
+    Some(f64::from(*median))
+}
+
+fn expect_size(image: &Image, intrinsics: &Intrinsics) -> Result<(), drivers::Error> {
+    if image.size_px == intrinsics.size_px {
+        return Ok(());
+    }
+    Err(drivers::Error::ImageSize {
+        camera: image.camera.to_string(),
+        stamp: image.stamp,
+        got_px: image.size_px,
+        expected_px: intrinsics.size_px,
+    })
+}

@@ -1,0 +1,102 @@
+//! Lists of keyframes: one line each with camera, stamp in nanoseconds, and split.
+
+use anyhow::{Context, bail};
+use kinematics::Stamp;
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::path::Path;
+use std::sync::Arc;
+use trainer::{Keyframe, Split};
+
+const SPLITS: [(Split, &str); 3] = [(Split::Train, "train"), (Split::Selection, "selection"), (Split::Test, "test")];
+
+/// Exactly these keyframes, with these splits.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) struct KeyframeList(BTreeMap<(String, i64), SplitName>);
+
+/// A split as its place in [`SPLITS`].
+type SplitName = usize;
+
+impl KeyframeList {
+    /// Reads a `keyframes.txt`.
+    pub(crate) fn load(path: &Path) -> anyhow::Result<Self> {
+        let text = std::fs::read_to_string(path).with_context(|| format!("cannot read the keyframe list {path:?}"))?;
+        Self::parse(&text).with_context(|| format!("the keyframe list {path:?}"))
+    }
+
+    /// How many keyframes are listed.
+    pub(crate) fn len(&self) -> usize {
+        self.0.len()
+    }
+
+    /// The split of a listed keyframe.
+    pub(crate) fn split_of(&self, camera: &str, stamp: Stamp) -> Option<Split> {
+        self.0.get(&(camera.to_owned(), stamp.0)).map(|split| SPLITS[*split].0)
+    }
+
+    fn parse(text: &str) -> anyhow::Result<Self> {
+        let mut list = BTreeMap::new();
+        for (line_ix, line) in
+            text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty() && !line.starts_with('#'))
+        {
+            let words: Vec<&str> = line.split_whitespace().collect();
+            let parsed = match words[..] {
+                [camera, stamp, split] => stamp
+                    .parse::<i64>()
+                    .ok()
+                    .zip(SPLITS.iter().position(|(_, name)| *name == split))
+                    .map(|(stamp, split)| ((camera.to_owned(), stamp), split)),
+                _ => None,
+            };
+            let Some((key, split)) = parsed else {
+                bail!(
+                    "line {}: {line:?} is not a camera, a stamp in nanoseconds and train, selection or test",
+                    line_ix + 1
+                );
+            };
+            if list.insert(key, split).is_some() {
+                bail!("line {}: {line:?} comes twice", line_ix + 1);
+            }
+        }
+        if list.is_empty() {
+            bail!("it names no keyframe");
+        }
+        Ok(Self(list))
+    }
+}
+
+/// The text of a `keyframes.txt`.
+pub(super) fn text_of<'a>(keyframes: impl Iterator<Item = &'a Arc<Keyframe>>) -> String {
+    let mut text = String::from("# camera stamp_nanos split\n");
+    for keyframe in keyframes {
+        let split = SPLITS.iter().find(|(split, _)| *split == keyframe.split).map_or("train", |(_, name)| name);
+        writeln!(text, "{} {} {split}", keyframe.camera, keyframe.stamp.0).expect("writing to a String cannot fail");
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_list_is_read_and_mistakes_are_named_with_their_line() {
+        let list = KeyframeList::parse("# camera stamp split\nwrist 17 test\n\nwrist -3 train\nside 17 selection\n")
+            .expect("a list");
+        assert_eq!(list.len(), 3);
+        assert_eq!(list.split_of("wrist", Stamp(17)), Some(Split::Test));
+        assert_eq!(list.split_of("wrist", Stamp(-3)), Some(Split::Train));
+        assert_eq!(list.split_of("side", Stamp(17)), Some(Split::Selection));
+        assert_eq!(list.split_of("side", Stamp(18)), None);
+        for (text, expected) in [
+            ("wrist 17\n", "line 1"),
+            ("wrist 1 train\nwrist x train\n", "line 2"),
+            ("wrist 1 taste\n", "line 1"),
+            ("wrist 1 train\nwrist 1 test\n", "twice"),
+            ("# nothing\n", "no keyframe"),
+        ] {
+            let message = KeyframeList::parse(text).expect_err(text).to_string();
+            assert!(message.contains(expected), "{message}");
+        }
+    }
+}

@@ -1,0 +1,341 @@
+//! Images + joint readings + calibration -> keyframes: the only place where devices and trainer meet.
+//!
+//! Samples go in one by one; what comes out depends on their order alone, so a live lockstep run, its recording and the
+//! replay of that give the same keyframes bit for bit.
+
+mod accept;
+mod assemble;
+mod list;
+mod motion;
+mod pixels;
+mod refusal;
+mod spacing;
+mod store;
+#[cfg(test)]
+mod tests;
+mod waiting;
+
+pub(crate) use list::KeyframeList;
+pub(crate) use refusal::{Counts, Refusal};
+
+use crate::config::{self, CameraDriver, Parent, Rig};
+use accept::Acceptance;
+use anyhow::Context;
+use assemble::Lens;
+use drivers::{Image, Sample, TruthImage};
+use kinematics::{HistoryError, Stamp, Transform};
+use motion::{Motion, Posed};
+use spacing::Spacing;
+use std::path::Path;
+use std::sync::Arc;
+use store::KeyframeStore;
+use trainer::{Keyframe, Split};
+use waiting::{Partner, Waiting};
+
+/// Makes keyframes of samples.
+pub(crate) struct Join {
+    motion: Motion,
+    cameras: Vec<CameraState>,
+    store: KeyframeStore,
+    list: Option<KeyframeList>,
+    counts: Counts,
+    max_wait_secs: f64,
+    default_depth_m: f64,
+    /// The latest stamp of all samples: the only clock there is.
+    newest: Stamp,
+}
+
+/// What a sample led to.
+#[derive(Clone, Debug)]
+pub(crate) enum JoinEvent {
+    /// A new keyframe; it is in the store.
+    Accepted(Arc<Keyframe>),
+    /// A keyframe left the full store.
+    Evicted { camera: Arc<str>, stamp: Stamp },
+    /// A colour image whose pose is known, keyframe or not.
+    Seen(Seen),
+    /// A colour image that became no keyframe.
+    Refused { camera: Arc<str>, stamp: Stamp, why: Refusal },
+}
+
+/// A colour image and where it was taken.
+#[derive(Clone, Debug)]
+pub(crate) struct Seen {
+    /// As the device sent it; not undistorted.
+    pub(crate) image: Image,
+    pub(crate) world_from_camera: Transform,
+}
+
+/// One camera of the rig.
+struct CameraState {
+    config: config::Camera,
+    color_lens: Lens,
+    depth_lens: Option<Lens>,
+    acceptance: Acceptance,
+    waiting: Waiting,
+    n_accepted: usize,
+    warned: bool,
+}
+
+/// A colour image about which everything is known that will be.
+struct Ripe {
+    image: Image,
+    stamp: Stamp,
+    posed: Posed,
+    depth: Option<(Image, Posed)>,
+    truth: Option<TruthImage>,
+}
+
+impl Join {
+    /// A join for the cameras and the arm of a rig.
+    pub(crate) fn new(rig: &Rig) -> anyhow::Result<Self> {
+        let join = &rig.join;
+        let spacing = Spacing { translation_m: join.min_translation_m, rotation_rad: join.min_rotation_rad };
+        Ok(Self {
+            motion: Motion::new(rig)?,
+            cameras: rig.cameras.iter().map(|camera| CameraState::new(camera, rig, spacing)).collect(),
+            store: KeyframeStore::new(join.max_keyframes, join.max_bytes, spacing),
+            list: None,
+            counts: Counts::default(),
+            max_wait_secs: join.max_wait_millis * 1e-3,
+            default_depth_m: join.default_depth_m,
+            newest: Stamp(i64::MIN),
+        })
+    }
+
+    /// Takes exactly the keyframes of a list, with its splits: no acceptance test, no bound.
+    pub(crate) fn taking_only(mut self, list: KeyframeList) -> Self {
+        self.store = KeyframeStore::new(usize::MAX, u64::MAX, Spacing { translation_m: 1.0, rotation_rad: 1.0 });
+        self.list = Some(list);
+        self
+    }
+
+    /// Takes in one sample; tells what followed from it.
+    pub(crate) fn push(&mut self, sample: Sample) -> Vec<JoinEvent> {
+        let mut events = Vec::new();
+        self.newest = self.newest.max(sample.stamp());
+        match sample {
+            Sample::Joints(state) => {
+                let sensible = self.motion.push_joints(state);
+                self.counts.joints_refused += u64::from(!sensible);
+            }
+            Sample::Base(pose) => {
+                self.motion.push_base(&pose);
+            }
+            Sample::Image(image) => self.push_image(image, &mut events),
+            Sample::Truth(truth) => {
+                if let Some(camera) = self.cameras.iter_mut().find(|camera| camera.config.name == truth.image.camera) {
+                    camera.waiting.push_truth(truth);
+                }
+            }
+        }
+        self.settle(false, &mut events);
+        events
+    }
+
+    /// Ends the stream: decides about the images that still wait.
+    pub(crate) fn finish(&mut self) -> Vec<JoinEvent> {
+        let mut events = Vec::new();
+        self.settle(true, &mut events);
+        events
+    }
+
+    /// What became of all images so far.
+    pub(crate) fn counts(&self) -> &Counts {
+        &self.counts
+    }
+
+    /// The keyframes in the store, in the order of their acceptance.
+    pub(crate) fn keyframes(&self) -> impl Iterator<Item = &Arc<Keyframe>> {
+        self.store.iter()
+    }
+
+    /// Writes `keyframes.txt`: camera, stamp and split of every keyframe in the store.
+    pub(crate) fn write_list(&self, path: &Path) -> anyhow::Result<()> {
+        std::fs::write(path, list::text_of(self.store.iter())).with_context(|| format!("cannot write {path:?}"))
+    }
+
+    fn push_image(&mut self, image: Image, events: &mut Vec<JoinEvent>) {
+        self.counts.device_skipped += image.n_skipped;
+        self.counts.images += u64::from(!image.is_depth());
+        let Some(camera) = self.cameras.iter_mut().find(|camera| camera.config.name == image.camera) else {
+            if !image.is_depth() {
+                self.refuse(image.camera, image.stamp, Refusal::UnknownCamera, events);
+            }
+            return;
+        };
+        if image.is_depth() {
+            let stamp = camera.mid_exposure(image.stamp);
+            camera.waiting.push_depth(stamp, image);
+        } else if let Some(crowded) = camera.waiting.push_color(image) {
+            let stamp = camera.mid_exposure(crowded.stamp);
+            self.refuse(crowded.camera, stamp, Refusal::Crowded, events);
+        }
+    }
+
+    /// Decides about every image that is ripe, oldest first, camera by camera.
+    fn settle(&mut self, at_end: bool, events: &mut Vec<JoinEvent>) {
+        for camera_ix in 0..self.cameras.len() {
+            while let Some(ripe) = self.next_ripe(camera_ix, at_end) {
+                match ripe {
+                    Ok(ripe) => {
+                        let seen = Seen { image: ripe.image.clone(), world_from_camera: ripe.posed.world_from_camera };
+                        events.push(JoinEvent::Seen(seen));
+                        self.decide(camera_ix, ripe, events);
+                    }
+                    Err((camera, stamp)) => self.refuse(camera, stamp, Refusal::NoPose, events),
+                }
+            }
+        }
+    }
+
+    /// The oldest waiting image of a camera once all is known about it; an error names one that will never have a pose.
+    fn next_ripe(&mut self, camera_ix: usize, at_end: bool) -> Option<Result<Ripe, (Arc<str>, Stamp)>> {
+        let camera = &mut self.cameras[camera_ix];
+        let device_stamp = camera.waiting.oldest()?.stamp;
+        let stamp = camera.mid_exposure(device_stamp);
+        let overdue = at_end || self.newest.secs_since(stamp) > self.max_wait_secs;
+        let posed = match self.motion.at(&camera.config, stamp) {
+            Err(HistoryError::NotYet { .. }) if !overdue => return None,
+            posed => posed,
+        };
+        let period_secs = 1.0 / camera.config.rate_hz;
+        let mut depth = None;
+        if camera.config.depth.is_some() && posed.is_ok() {
+            let (depth_stamp, is_final) = camera.waiting.depth_near(stamp, 0.5 * period_secs);
+            if !is_final && !overdue {
+                return None;
+            }
+            if let Some(depth_stamp) = depth_stamp {
+                match self.motion.at(&camera.config, depth_stamp) {
+                    Err(HistoryError::NotYet { .. }) if !overdue => return None,
+                    Ok(posed) => depth = camera.waiting.depth_at(depth_stamp).cloned().zip(Some(posed)),
+                    Err(_) => {}
+                }
+            }
+        }
+        let truth = match camera.waiting.truth_of(device_stamp) {
+            Partner::NotYet if !overdue && posed.is_ok() => return None,
+            Partner::Here(truth) => Some(truth.clone()),
+            Partner::NotYet | Partner::Never => None,
+        };
+        if truth.is_none() && overdue && posed.is_ok() {
+            camera.waiting.give_up_truth();
+        }
+        let image = camera.waiting.take_oldest()?;
+        camera.waiting.forget_before(stamp, device_stamp, period_secs);
+        match posed {
+            Ok(posed) => Some(Ok(Ripe { image, stamp, posed, depth, truth })),
+            Err(_) => Some(Err((image.camera, stamp))),
+        }
+    }
+
+    fn decide(&mut self, camera_ix: usize, ripe: Ripe, events: &mut Vec<JoinEvent>) {
+        let listed = self.list.as_ref().map(|list| list.split_of(&ripe.image.camera, ripe.stamp));
+        let (name, stamp) = (Arc::clone(&ripe.image.camera), ripe.stamp);
+        let camera = &mut self.cameras[camera_ix];
+        let split = match listed {
+            Some(None) => return, // Not asked for, which is no refusal.
+            Some(Some(split)) => split,
+            None => Split::of(camera.n_accepted),
+        };
+        let keyframe = match camera.keyframe(ripe, split, listed.is_none(), self.default_depth_m) {
+            Ok(keyframe) => Arc::new(keyframe),
+            Err(why) => return self.refuse(name, stamp, why, events),
+        };
+        camera.n_accepted += 1;
+        self.counts.accepted += 1;
+        self.counts.without_depth += u64::from(camera.config.depth.is_some() && keyframe.depth.is_none());
+        events.push(JoinEvent::Accepted(Arc::clone(&keyframe)));
+        for (camera, stamp) in self.store.push(keyframe) {
+            self.counts.evicted += 1;
+            events.push(JoinEvent::Evicted { camera, stamp });
+        }
+    }
+
+    fn refuse(&mut self, camera: Arc<str>, stamp: Stamp, why: Refusal, events: &mut Vec<JoinEvent>) {
+        self.counts.refuse(why);
+        events.push(JoinEvent::Refused { camera, stamp, why });
+    }
+}
+
+impl CameraState {
+    fn new(camera: &config::Camera, rig: &Rig, spacing: Spacing) -> Self {
+        if camera.readout_micros.is_none() && camera.parent == Parent::Flange {
+            log::warn!("camera {:?}: readout_micros is not in the rig file; taken for a global shutter", camera.name);
+        }
+        if camera.stamp_to_mid_exposure.is_none() && camera.driver != CameraDriver::Sim {
+            log::warn!("camera {:?}: stamp_to_mid_exposure_millis is not in the rig file; taken for 0", camera.name);
+        }
+        Self {
+            config: camera.clone(),
+            color_lens: Lens::new(&camera.intrinsics),
+            depth_lens: camera.depth.as_ref().map(|depth| Lens::new(&depth.intrinsics)),
+            acceptance: Acceptance::new(&rig.join, camera, spacing),
+            waiting: Waiting::new(camera.driver == CameraDriver::Sim && rig.sim.truth),
+            n_accepted: 0,
+            warned: false,
+        }
+    }
+
+    fn mid_exposure(&self, device_stamp: Stamp) -> Stamp {
+        let offset = self.config.stamp_to_mid_exposure.as_ref();
+        offset.map_or(device_stamp, |offset| device_stamp.plus_secs(offset.value_millis * 1e-3))
+    }
+
+    /// The keyframe of an image, or why it becomes none; `judge` is off where a list has decided already.
+    fn keyframe(&mut self, ripe: Ripe, split: Split, judge: bool, default_depth_m: f64) -> Result<Keyframe, Refusal> {
+        let pose = &ripe.posed.world_from_camera;
+        if !motion::is_finite(pose) {
+            return Err(Refusal::PoseNotFinite);
+        }
+        if judge {
+            self.acceptance.judge_motion(ripe.stamp, pose)?;
+        }
+        let depth = self.depth_of(&ripe);
+        if judge {
+            let depth_m = depth.as_ref().and_then(assemble::median_depth_m).unwrap_or(default_depth_m);
+            let exposure_secs = ripe.image.exposure_secs.or(self.config.exposure_micros.map(|micros| micros * 1e-6));
+            self.acceptance.judge_speed(&ripe.posed, self.color_lens.pinhole(), exposure_secs, depth_m)?;
+        }
+        let rgb = assemble::rgb(&ripe.image, &self.config.intrinsics).map_err(|e| self.undecodable(&e))?;
+        if judge {
+            self.acceptance.judge_pixels(&rgb, self.config.intrinsics.size_px)?;
+            self.acceptance.accept(ripe.stamp, pose);
+        }
+        let rgba_srgb = self.color_lens.rgba(&rgb).map_err(|e| self.undecodable(&e))?;
+        let truth = ripe.truth.and_then(|truth| {
+            assemble::truth(&truth, &self.config.intrinsics, &self.color_lens).map_err(|e| self.undecodable(&e)).ok()
+        });
+        let pinhole = self.color_lens.pinhole();
+        Ok(Keyframe {
+            camera: ripe.image.camera,
+            stamp: ripe.stamp,
+            size_px: pinhole.size_px,
+            focal_px: pinhole.focal_px,
+            principal_px: pinhole.principal_px,
+            rgba_srgb,
+            depth,
+            world_from_camera: ripe.posed.world_from_camera,
+            twist: ripe.posed.twist,
+            readout_secs: self.acceptance.readout_secs(),
+            split,
+            truth,
+        })
+    }
+
+    /// Depth that does not decode costs the depth, not the keyframe.
+    fn depth_of(&mut self, ripe: &Ripe) -> Option<trainer::DepthMap> {
+        let (image, posed) = ripe.depth.as_ref()?;
+        let map = assemble::depth_map(image, self.config.depth.as_ref()?, self.depth_lens.as_ref()?, posed);
+        map.map_err(|e| self.undecodable(&e)).ok()
+    }
+
+    /// Says once a camera what is wrong with its images; the count tells how often.
+    fn undecodable(&mut self, error: &anyhow::Error) -> Refusal {
+        if !std::mem::replace(&mut self.warned, true) {
+            log::warn!("{error:#}");
+        }
+        Refusal::Undecodable
+    }
+}

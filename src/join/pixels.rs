@@ -1,0 +1,163 @@
+//! What the pixels of an image say about it: brightness, clipping, sharpness.
+
+/// The reduced image is about this wide, so that sharpness means the same for every camera and noise averages out.
+const REDUCED_WIDTH: usize = 320;
+/// Sharpness is compared with the median of this many images before.
+const MEMORY: usize = 31;
+/// Brightness at and beyond which a pixel is clipped, of 255.
+const CLIPPED: [u8; 2] = [1, 254];
+
+/// Brightness and sharpness of one image.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct PixelFacts {
+    /// Mean brightness, 0 to 1.
+    pub(super) luma_frac: f64,
+    /// Share of the pixels that are black or white.
+    pub(super) clipped_frac: f64,
+    /// Variance of the Laplacian of the reduced image; only its ratio to other images of the same camera means something.
+    pub(super) sharpness: f64,
+}
+
+impl PixelFacts {
+    /// `rgb` is `[height, width, 3]`, sRGB.
+    pub(super) fn of(rgb: &[u8], size_px: [u32; 2]) -> Self {
+        let [width, height] = size_px.map(|side| side as usize);
+        let block = (width / REDUCED_WIDTH).max(1);
+        let reduced = Reduced::of(rgb, [width, height], block);
+        #[expect(clippy::cast_precision_loss, reason = "counts of pixels stay far below 2^53")]
+        let share = |n: u64| n as f64 / (reduced.n_pixels as f64).max(1.0);
+        Self {
+            luma_frac: share(reduced.luma_sum) / 255.0,
+            clipped_frac: share(reduced.n_clipped),
+            sharpness: reduced.laplacian_variance(),
+        }
+    }
+}
+
+/// Block means of the brightness.
+struct Reduced {
+    size: [usize; 2],
+    luma: Vec<f64>,
+    luma_sum: u64,
+    n_clipped: u64,
+    n_pixels: u64,
+}
+
+impl Reduced {
+    fn of(rgb: &[u8], [width, height]: [usize; 2], block: usize) -> Self {
+        let size = [width / block, height / block];
+        let mut sums = vec![0_u32; size[0] * size[1]];
+        let mut reduced = Self { size, luma: Vec::new(), luma_sum: 0, n_clipped: 0, n_pixels: 0 };
+        for row in 0..size[1] * block {
+            let line = &rgb[row * width * 3..][..size[0] * block * 3];
+            let out = &mut sums[row / block * size[0]..][..size[0]];
+            for (pixels, sum) in line.chunks_exact(block * 3).zip(out) {
+                for pixel in pixels.as_chunks::<3>().0 {
+                    let luma = luma(*pixel);
+                    *sum += luma;
+                    let clipped = pixel.iter().all(|c| *c <= CLIPPED[0]) || pixel.iter().all(|c| *c >= CLIPPED[1]);
+                    reduced.n_clipped += u64::from(clipped);
+                }
+            }
+        }
+        #[expect(clippy::cast_precision_loss, reason = "a block has few pixels")]
+        let per_block = (block * block) as f64;
+        reduced.luma_sum = sums.iter().map(|sum| u64::from(*sum)).sum();
+        reduced.n_pixels = (sums.len() * block * block) as u64;
+        reduced.luma = sums.into_iter().map(|sum| f64::from(sum) / per_block).collect();
+        reduced
+    }
+
+    fn laplacian_variance(&self) -> f64 {
+        let [width, height] = self.size;
+        let (mut n, mut sum, mut sum_of_squares) = (0.0, 0.0, 0.0);
+        for row in 1..height.saturating_sub(1) {
+            for column in 1..width.saturating_sub(1) {
+                let at = row * width + column;
+                let around = self.luma[at - 1] + self.luma[at + 1] + self.luma[at - width] + self.luma[at + width];
+                let laplacian = around - 4.0 * self.luma[at];
+                n += 1.0;
+                sum += laplacian;
+                sum_of_squares += laplacian * laplacian;
+            }
+        }
+        if n == 0.0 { 0.0 } else { sum_of_squares / n - (sum / n) * (sum / n) }
+    }
+}
+
+/// Brightness 0 to 255 with the weights of Rec. 601 in 256ths.
+fn luma([red, green, blue]: [u8; 3]) -> u32 {
+    (u32::from(red) * 77 + u32::from(green) * 150 + u32::from(blue) * 29) >> 8
+}
+
+/// The sharpness of a camera's last images.
+#[derive(Clone, Debug, Default)]
+pub(super) struct SharpnessMemory(std::collections::VecDeque<f64>);
+
+impl SharpnessMemory {
+    /// Sharpness relative to the median of the last images, this one included; then remembers it.
+    pub(super) fn relative(&mut self, sharpness: f64) -> f64 {
+        if self.0.len() == MEMORY {
+            self.0.pop_front();
+        }
+        self.0.push_back(sharpness);
+        let mut sorted: Vec<f64> = self.0.iter().copied().collect();
+        sorted.sort_by(f64::total_cmp);
+        let median = sorted[sorted.len() / 2];
+        if median > 0.0 { sharpness / median } else { 1.0 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Stripes of a period in pixels, softened over `blur` pixels.
+    fn stripes(size_px: [u32; 2], period: u32, blur: u32) -> Vec<u8> {
+        let level = |x: u32| if (x / period).is_multiple_of(2) { 40_u32 } else { 200 };
+        let soft = |x: u32| u8::try_from((0..=blur).map(|dx| level(x + dx)).sum::<u32>() / (blur + 1)).expect("a mean");
+        (0..size_px[1]).flat_map(|_| (0..size_px[0]).flat_map(|x| [soft(x); 3])).collect()
+    }
+
+    #[test]
+    fn blur_lowers_sharpness_and_leaves_brightness() {
+        for size_px in [[160, 120], [640, 480], [1280, 720]] {
+            let facts = [0, 8, 24].map(|blur| PixelFacts::of(&stripes(size_px, 32, blur * size_px[0] / 640), size_px));
+            assert!(
+                facts[0].sharpness >= facts[1].sharpness && facts[1].sharpness > 1.3 * facts[2].sharpness,
+                "{size_px:?}: {facts:?}"
+            );
+            assert!(
+                (facts[0].luma_frac - facts[2].luma_frac).abs() < 0.02 && facts[0].clipped_frac == 0.0,
+                "{facts:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn clipped_pixels_are_counted_and_flat_images_have_no_sharpness() {
+        let mut rgb = vec![255; 30 * 20 * 3];
+        rgb[..30 * 5 * 3].fill(0);
+        rgb[30 * 5 * 3..30 * 10 * 3].fill(128);
+        let facts = PixelFacts::of(&rgb, [30, 20]);
+        assert!((facts.clipped_frac - 0.75).abs() < 1e-12, "{facts:?}");
+        assert_eq!(PixelFacts::of(&[77; 8 * 8 * 3], [8, 8]).sharpness, 0.0);
+        assert_eq!(PixelFacts::of(&[77; 3], [1, 1]).sharpness, 0.0, "too small for a Laplacian");
+    }
+
+    #[test]
+    fn sharpness_is_relative_to_what_the_camera_usually_gives() {
+        for scale in [1.0, 1e4] {
+            let mut memory = SharpnessMemory::default();
+            assert_eq!(memory.relative(5.0 * scale), 1.0, "the first image has nothing to be compared with");
+            for _ in 0..40 {
+                memory.relative(10.0 * scale);
+            }
+            assert!((memory.relative(2.0 * scale) - 0.2).abs() < 1e-12);
+            for _ in 0..20 {
+                memory.relative(2.0 * scale);
+            }
+            assert!(memory.relative(2.0 * scale) > 0.9, "a dull scene becomes the new measure");
+        }
+    }
+}

@@ -1,0 +1,127 @@
+//! Why images did not become keyframes, counted.
+
+use std::collections::BTreeMap;
+
+/// Why an image did not become a keyframe.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub(crate) enum Refusal {
+    /// The rig file has no camera of this name.
+    UnknownCamera,
+    /// Too many images waited for joint readings.
+    Crowded,
+    /// No joint readings around the stamp, or no base pose.
+    NoPose,
+    /// The pose holds NaN or infinity.
+    PoseNotFinite,
+    /// The camera has not moved enough since its nearest keyframe.
+    NotMoved,
+    /// The predicted motion blur is too long.
+    Blur,
+    /// The predicted rolling-shutter shear is too large.
+    Shear,
+    /// The shutter rolls and the velocity of the camera is not known.
+    ShearUnknown,
+    /// The image does not decode.
+    Undecodable,
+    /// The image is too dark, too bright, or clipped.
+    Exposure,
+    /// The image is less sharp than its camera's images usually are.
+    NotSharp,
+}
+
+impl Refusal {
+    /// A word for programs.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::UnknownCamera => "unknown_camera",
+            Self::Crowded => "crowded",
+            Self::NoPose => "no_pose",
+            Self::PoseNotFinite => "pose_not_finite",
+            Self::NotMoved => "not_moved",
+            Self::Blur => "blur",
+            Self::Shear => "shear",
+            Self::ShearUnknown => "shear_unknown",
+            Self::Undecodable => "undecodable",
+            Self::Exposure => "exposure",
+            Self::NotSharp => "not_sharp",
+        }
+    }
+}
+
+impl std::fmt::Display for Refusal {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::UnknownCamera => "camera not in the rig file",
+            Self::Crowded => "too many waited for joint readings",
+            Self::NoPose => "no joint readings around the stamp",
+            Self::PoseNotFinite => "pose is not a number",
+            Self::NotMoved => "not moved",
+            Self::Blur => "motion blur",
+            Self::Shear => "rolling-shutter shear",
+            Self::ShearUnknown => "rolling shutter at unknown velocity",
+            Self::Undecodable => "does not decode",
+            Self::Exposure => "badly exposed",
+            Self::NotSharp => "not sharp",
+        })
+    }
+}
+
+/// What became of all images.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Counts {
+    /// Colour images that came.
+    pub(crate) images: u64,
+    /// Images that became keyframes.
+    pub(crate) accepted: u64,
+    /// Keyframes that went again because the store was full.
+    pub(crate) evicted: u64,
+    /// Keyframes of cameras with depth that had to go without.
+    pub(crate) without_depth: u64,
+    /// Images that devices or queues lost before they came here.
+    pub(crate) device_skipped: u64,
+    /// Joint readings that were out of order, not numbers, or of another arm.
+    pub(crate) joints_refused: u64,
+    /// Images refused, by reason.
+    pub(crate) refused: BTreeMap<Refusal, u64>,
+}
+
+impl Counts {
+    pub(super) fn refuse(&mut self, why: Refusal) {
+        *self.refused.entry(why).or_default() += 1;
+    }
+}
+
+impl std::fmt::Display for Counts {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{} keyframes of {} images", self.accepted, self.images)?;
+        for (why, n) in &self.refused {
+            write!(f, "; {n} {why}")?;
+        }
+        let rest = [
+            (self.evicted, "evicted from the full store"),
+            (self.without_depth, "without depth"),
+            (self.device_skipped, "lost by devices"),
+            (self.joints_refused, "joint readings refused"),
+        ];
+        for (n, what) in rest {
+            if n > 0 {
+                write!(f, "; {n} {what}")?;
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_summary_tells_what_happened_and_nothing_else() {
+        let mut counts = Counts { images: 9, accepted: 4, device_skipped: 2, ..Counts::default() };
+        counts.refuse(Refusal::NotMoved);
+        counts.refuse(Refusal::NotMoved);
+        counts.refuse(Refusal::Blur);
+        assert_eq!(counts.to_string(), "4 keyframes of 9 images; 2 not moved; 1 motion blur; 2 lost by devices");
+    }
+}

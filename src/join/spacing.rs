@@ -1,0 +1,33 @@
+//! How far apart two poses are, in units of the distance that makes a new keyframe worth its memory.
+
+use kinematics::Transform;
+
+/// The motion that counts as one.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Spacing {
+    pub(super) translation_m: f64,
+    pub(super) rotation_rad: f64,
+}
+
+impl Spacing {
+    /// The larger of translation and rotation, each in units of its own; 1 is just enough.
+    pub(super) fn between(&self, a: &Transform, b: &Transform) -> f64 {
+        let translation_m = (a.translation.vector - b.translation.vector).norm();
+        (translation_m / self.translation_m).max(a.rotation.angle_to(&b.rotation) / self.rotation_rad)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Vector3;
+
+    #[test]
+    fn the_larger_motion_counts() {
+        let spacing = Spacing { translation_m: 0.02, rotation_rad: 0.1 };
+        let at = |x, turn| Transform::new(Vector3::new(x, 0.0, 0.0), Vector3::new(0.0, turn, 0.0));
+        for (x, turn, expected) in [(0.0, 0.0, 0.0), (0.01, 0.0, 0.5), (0.01, 0.2, 2.0), (0.06, 0.2, 3.0)] {
+            assert!((spacing.between(&at(1.0, 1.0), &at(1.0 + x, 1.0 + turn)) - expected).abs() < 1e-9);
+        }
+    }
+}

@@ -1,0 +1,170 @@
+//! The keyframes that are kept: bounded in count and bytes, the most redundant goes first.
+//!
+//! What goes comes from the split (train, selection, test) that holds more than its share, so that the three keep their
+//! proportions in a long run: were test keyframes spared, they would fill the store in the end. Within that split the keyframe
+//! nearest to another one of its camera goes, and of two equally near ones the older.
+
+use super::spacing::Spacing;
+use kinematics::Stamp;
+use std::sync::Arc;
+use trainer::{Keyframe, Split};
+
+/// Shares of the splits: every 8th is test, every 8th selection.
+const SHARES: [(Split, f64); 3] = [(Split::Train, 6.0), (Split::Selection, 1.0), (Split::Test, 1.0)];
+
+/// Keyframes in the order of their acceptance.
+#[derive(Debug)]
+pub(super) struct KeyframeStore {
+    max_keyframes: usize,
+    max_bytes: u64,
+    spacing: Spacing,
+    kept: Vec<Kept>,
+    bytes: u64,
+}
+
+#[derive(Debug)]
+struct Kept {
+    keyframe: Arc<Keyframe>,
+    bytes: u64,
+    /// Distance to the nearest other keyframe of the same camera.
+    nearest: f64,
+}
+
+impl KeyframeStore {
+    pub(super) fn new(max_keyframes: usize, max_bytes: u64, spacing: Spacing) -> Self {
+        Self { max_keyframes, max_bytes, spacing, kept: Vec::new(), bytes: 0 }
+    }
+
+    pub(super) fn iter(&self) -> impl Iterator<Item = &Arc<Keyframe>> {
+        self.kept.iter().map(|kept| &kept.keyframe)
+    }
+
+    /// Adds a keyframe; gives the cameras and stamps of those that had to go for it.
+    pub(super) fn push(&mut self, keyframe: Arc<Keyframe>) -> Vec<(Arc<str>, Stamp)> {
+        let mut nearest = f64::INFINITY;
+        for kept in self.kept.iter_mut().filter(|kept| kept.keyframe.camera == keyframe.camera) {
+            let distance = self.spacing.between(&kept.keyframe.world_from_camera, &keyframe.world_from_camera);
+            kept.nearest = kept.nearest.min(distance);
+            nearest = nearest.min(distance);
+        }
+        let bytes = bytes_of(&keyframe);
+        self.bytes += bytes;
+        self.kept.push(Kept { keyframe, bytes, nearest });
+        let mut gone = Vec::new();
+        while self.kept.len() > 1 && (self.kept.len() > self.max_keyframes || self.bytes > self.max_bytes) {
+            let keyframe = self.remove(self.most_redundant());
+            gone.push((Arc::clone(&keyframe.camera), keyframe.stamp));
+        }
+        gone
+    }
+
+    fn most_redundant(&self) -> usize {
+        let count = |split| self.kept.iter().filter(|kept| kept.keyframe.split == split).count();
+        #[expect(clippy::cast_precision_loss, reason = "a store holds far fewer than 2^53 keyframes")]
+        let load = |(split, share): &(Split, f64)| count(*split) as f64 / share;
+        let fullest = SHARES.iter().max_by(|a, b| load(a).total_cmp(&load(b))).map(|(split, _)| *split);
+        let candidates = self.kept.iter().enumerate().filter(|(_, kept)| Some(kept.keyframe.split) == fullest);
+        candidates.min_by(|(_, a), (_, b)| a.nearest.total_cmp(&b.nearest)).map_or(0, |(ix, _)| ix)
+    }
+
+    fn remove(&mut self, ix: usize) -> Arc<Keyframe> {
+        let gone = self.kept.remove(ix);
+        self.bytes -= gone.bytes;
+        let same_camera: Vec<usize> =
+            (0..self.kept.len()).filter(|ix| self.kept[*ix].keyframe.camera == gone.keyframe.camera).collect();
+        let pose = |ix: usize| &self.kept[ix].keyframe.world_from_camera;
+        let orphaned: Vec<(usize, f64)> = same_camera
+            .iter()
+            .filter(|ix| self.spacing.between(pose(**ix), &gone.keyframe.world_from_camera) <= self.kept[**ix].nearest)
+            .map(|ix| {
+                let others = same_camera.iter().filter(|other| *other != ix);
+                let distances = others.map(|other| self.spacing.between(pose(*ix), pose(*other)));
+                (*ix, distances.fold(f64::INFINITY, f64::min))
+            })
+            .collect();
+        for (ix, nearest) in orphaned {
+            self.kept[ix].nearest = nearest;
+        }
+        gone.keyframe
+    }
+}
+
+/// Host memory that a keyframe holds.
+fn bytes_of(keyframe: &Keyframe) -> u64 {
+    let depth = keyframe.depth.as_ref().map_or(0, |depth| depth.depth_m.len() * size_of::<f32>());
+    let truth = keyframe.truth.as_ref().map_or(0, |truth| truth.rgba_srgb.len());
+    (keyframe.rgba_srgb.len() + depth + truth) as u64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use kinematics::Transform;
+    use nalgebra::Vector3;
+
+    fn keyframe(ix: usize, camera: &str, x_m: f64) -> Arc<Keyframe> {
+        Arc::new(Keyframe {
+            camera: camera.into(),
+            stamp: Stamp(i64::try_from(ix).expect("small")),
+            size_px: [2, 2],
+            focal_px: [1.0; 2],
+            principal_px: [1.0; 2],
+            rgba_srgb: vec![0; 16].into(),
+            depth: None,
+            world_from_camera: Transform::new(Vector3::new(x_m, 0.0, 0.0), Vector3::zeros()),
+            twist: None,
+            readout_secs: 0.0,
+            split: Split::of(ix),
+            truth: None,
+        })
+    }
+
+    fn store(max_keyframes: usize, max_bytes: u64) -> KeyframeStore {
+        KeyframeStore::new(max_keyframes, max_bytes, Spacing { translation_m: 1.0, rotation_rad: 1.0 })
+    }
+
+    fn stamps(store: &KeyframeStore) -> Vec<i64> {
+        store.iter().map(|keyframe| keyframe.stamp.0).collect()
+    }
+
+    #[test]
+    fn the_most_redundant_goes_first_whatever_bound_is_met() {
+        for mut store in [store(7, u64::MAX), store(usize::MAX, 7 * 16)] {
+            let mut gone = Vec::new();
+            // 2 and 6 are close to each other, 1 and 8 the same close but of two cameras.
+            for (ix, camera, x_m) in
+                [(1, "a", 0.0), (2, "a", 9.0), (3, "a", 20.0), (5, "a", 30.0), (6, "a", 9.1), (7, "a", 40.0)]
+            {
+                gone.extend(store.push(keyframe(ix, camera, x_m)));
+            }
+            gone.extend(store.push(keyframe(9, "b", 0.0)));
+            assert_eq!(gone, []);
+            assert_eq!(store.push(keyframe(10, "a", 50.0)), [("a".into(), Stamp(2))]);
+            assert_eq!(stamps(&store), [1, 3, 5, 6, 7, 9, 10]);
+            // With 2 gone, 6 stands alone and the closest pair is the next one.
+            assert_eq!(store.push(keyframe(11, "a", 20.5)), [("a".into(), Stamp(3))]);
+        }
+    }
+
+    #[test]
+    fn a_long_run_keeps_the_shares_of_the_splits_and_the_bounds() {
+        let mut store = store(40, u64::MAX);
+        for ix in 0..2000 {
+            #[expect(clippy::cast_precision_loss, reason = "small numbers")]
+            let x_m = (ix as f64 * 0.754_877).fract() * 10.0;
+            store.push(keyframe(ix, "a", x_m));
+            assert!(store.kept.len() <= 40 && store.bytes == store.kept.len() as u64 * 16);
+        }
+        let count = |split| store.iter().filter(|keyframe| keyframe.split == split).count();
+        assert_eq!([count(Split::Train), count(Split::Selection), count(Split::Test)], [30, 5, 5]);
+        // The cached distances are the true ones.
+        for (ix, kept) in store.kept.iter().enumerate() {
+            let others = store.kept.iter().enumerate().filter(|(other, _)| *other != ix);
+            let poses = others.map(|(_, other)| &other.keyframe.world_from_camera);
+            let nearest = poses
+                .map(|pose| store.spacing.between(pose, &kept.keyframe.world_from_camera))
+                .fold(f64::INFINITY, f64::min);
+            assert_eq!(kept.nearest, nearest);
+        }
+    }
+}

@@ -1,0 +1,103 @@
+//! Images of one camera that wait until everything about them is known.
+//!
+//! Colour, depth and ground truth come in any order; joint readings may come before or after. What is decided depends on the
+//! order of the samples only, never on a clock, so that a replay decides the same.
+
+use drivers::{Image, TruthImage};
+use kinematics::Stamp;
+use std::collections::VecDeque;
+
+/// Images of each kind that may wait.
+const MAX_WAITING: usize = 64;
+
+/// Samples of one camera, each kind in stamp order.
+#[derive(Debug)]
+pub(super) struct Waiting {
+    color: VecDeque<Image>,
+    depth: VecDeque<(Stamp, Image)>,
+    truth: VecDeque<TruthImage>,
+    /// Whether ground truth is worth waiting for.
+    expects_truth: bool,
+}
+
+/// A partner that an image may have.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Partner<T> {
+    /// It is here.
+    Here(T),
+    /// It may still come.
+    NotYet,
+    /// There will be none.
+    Never,
+}
+
+impl Waiting {
+    pub(super) fn new(expects_truth: bool) -> Self {
+        Self { color: VecDeque::new(), depth: VecDeque::new(), truth: VecDeque::new(), expects_truth }
+    }
+
+    /// Queues a colour image; gives back the oldest where too many wait.
+    pub(super) fn push_color(&mut self, image: Image) -> Option<Image> {
+        let crowded = if self.color.len() == MAX_WAITING { self.color.pop_front() } else { None };
+        self.color.push_back(image);
+        crowded
+    }
+
+    /// Queues a depth image; `stamp` is its mid-exposure.
+    pub(super) fn push_depth(&mut self, stamp: Stamp, image: Image) {
+        push(&mut self.depth, (stamp, image));
+    }
+
+    pub(super) fn push_truth(&mut self, truth: TruthImage) {
+        self.expects_truth = true;
+        push(&mut self.truth, truth);
+    }
+
+    pub(super) fn oldest(&self) -> Option<&Image> {
+        self.color.front()
+    }
+
+    pub(super) fn take_oldest(&mut self) -> Option<Image> {
+        self.color.pop_front()
+    }
+
+    /// Mid-exposure of the depth image nearest to a stamp, at most `within_secs` away, and whether that is final.
+    pub(super) fn depth_near(&self, stamp: Stamp, within_secs: f64) -> (Option<Stamp>, bool) {
+        let nearest = self.depth.iter().map(|(at, _)| *at).min_by_key(|at| at.nanos_since(stamp).unsigned_abs());
+        // Depth comes in order, so after one at or past the stamp no nearer one follows.
+        let is_final = self.depth.back().is_some_and(|(newest, _)| *newest >= stamp);
+        (nearest.filter(|at| at.secs_since(stamp).abs() <= within_secs), is_final)
+    }
+
+    /// The depth image of a mid-exposure, for one more colour image may want it too.
+    pub(super) fn depth_at(&self, stamp: Stamp) -> Option<&Image> {
+        self.depth.iter().find(|(at, _)| *at == stamp).map(|(_, image)| image)
+    }
+
+    /// The ground truth of a colour image, by the stamp the device gave it.
+    pub(super) fn truth_of(&self, device_stamp: Stamp) -> Partner<&TruthImage> {
+        match self.truth.iter().find(|truth| truth.image.stamp == device_stamp) {
+            Some(truth) => Partner::Here(truth),
+            None if self.expects_truth => Partner::NotYet,
+            None => Partner::Never,
+        }
+    }
+
+    /// Says that ground truth was waited for in vain.
+    pub(super) fn give_up_truth(&mut self) {
+        self.expects_truth = false;
+    }
+
+    /// Forgets what belongs to images before this colour image.
+    pub(super) fn forget_before(&mut self, stamp: Stamp, device_stamp: Stamp, period_secs: f64) {
+        self.truth.retain(|truth| truth.image.stamp > device_stamp);
+        self.depth.retain(|(at, _)| stamp.secs_since(*at) <= period_secs);
+    }
+}
+
+fn push<T>(queue: &mut VecDeque<T>, item: T) {
+    if queue.len() == MAX_WAITING {
+        queue.pop_front();
+    }
+    queue.push_back(item);
+}

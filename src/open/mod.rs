@@ -1,0 +1,170 @@
+//! Opens what a rig file or a recording names, as one source of samples.
+
+#[cfg(feature = "sim")]
+mod simulated;
+
+use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Rig};
+use anyhow::{Context, bail};
+use drivers::recording::{About, RIG_FILE, Recorder, Recording, URDF_FILE};
+use drivers::{Error, Sample, Source};
+use std::path::Path;
+use std::sync::{Arc, OnceLock};
+
+/// Which devices a rig file stands for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Devices {
+    /// Those that it names.
+    Real,
+    /// Their simulated twins: same names, sizes, rates, lenses, robot.
+    Sim,
+}
+
+/// An open rig.
+pub(crate) struct Opened {
+    /// The settled rig.
+    pub(crate) rig: Rig,
+    pub(crate) source: Box<dyn Source>,
+    /// Set once the samples have ended early because a recording is damaged.
+    pub(crate) damage: Arc<OnceLock<String>>,
+}
+
+/// Opens the devices of a rig.
+pub(crate) fn rig(mut rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
+    if devices == Devices::Sim {
+        rig.arm.driver = ArmDriver::Sim;
+        rig.base.driver = BaseDriver::Fixed;
+        for camera in &mut rig.cameras {
+            camera.driver = CameraDriver::Sim;
+        }
+    }
+    if let Some(device) = absent_device(&rig) {
+        bail!("{device} cannot be opened by this version; --sim replaces every device by its simulated twin");
+    }
+    let source = simulate(&rig)?;
+    Ok(Opened { rig, source, damage: Arc::default() })
+}
+
+/// Opens a recording with the rig stored in it, or with another one.
+pub(crate) fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> anyhow::Result<Opened> {
+    let recording = Recording::open(path)?;
+    let rig = match rig {
+        Some(rig) => rig,
+        None => stored_rig(path, &recording, overrides)?,
+    };
+    let damage = Arc::default();
+    let source = Box::new(Replay { recording, damage: Arc::clone(&damage) });
+    Ok(Opened { rig, source, damage })
+}
+
+/// Begins a recording of a rig; rig file and robot's description go into it.
+pub(crate) fn recorder(path: &Path, rig: &Rig) -> anyhow::Result<Recorder> {
+    let cameras: Vec<_> = rig.cameras.iter().map(|camera| (&*camera.name, &camera.intrinsics)).collect();
+    let settled = rig.to_toml();
+    let about = About {
+        files: &[(RIG_FILE, settled.as_bytes()), (URDF_FILE, rig.arm.urdf_text.as_bytes())],
+        cameras: &cameras,
+        joint_names: &rig.arm.joints,
+    };
+    Ok(Recorder::create(path, &about)?)
+}
+
+fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> anyhow::Result<Rig> {
+    let text = |name| {
+        let bytes = recording.attachment(name).with_context(|| format!("the recording {path:?} holds no {name}"))?;
+        std::str::from_utf8(bytes).with_context(|| format!("the recording {path:?}: {name} is not text"))
+    };
+    Ok(Rig::parse(RIG_FILE, text(RIG_FILE)?, text(URDF_FILE)?, overrides)?)
+}
+
+/// The first device of a rig that has no driver yet.
+fn absent_device(rig: &Rig) -> Option<String> {
+    if rig.arm.driver != ArmDriver::Sim {
+        return Some(format!("arm driver {:?}", format!("{:?}", rig.arm.driver).to_lowercase()));
+    }
+    if rig.base.driver != BaseDriver::Fixed {
+        return Some(format!("base driver {:?}", format!("{:?}", rig.base.driver).to_lowercase()));
+    }
+    let camera = rig.cameras.iter().find(|camera| camera.driver != CameraDriver::Sim)?;
+    Some(format!("camera {:?} with driver {:?}", camera.name, format!("{:?}", camera.driver).to_lowercase()))
+}
+
+#[cfg(feature = "sim")]
+fn simulate(rig: &Rig) -> anyhow::Result<Box<dyn Source>> {
+    simulated::open(rig)
+}
+
+#[cfg(not(feature = "sim"))]
+fn simulate(_rig: &Rig) -> anyhow::Result<Box<dyn Source>> {
+    bail!("this program was built without the simulator: build it with `cargo build --release --features sim`")
+}
+
+/// A recording that says at its end what was wrong with it.
+struct Replay {
+    recording: Recording,
+    damage: Arc<OnceLock<String>>,
+}
+
+impl Source for Replay {
+    fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
+        let sample = self.recording.next_sample()?;
+        if sample.is_none()
+            && let Some(damage) = self.recording.damage()
+            && self.damage.set(damage.to_owned()).is_ok()
+        {
+            log::warn!("{damage}");
+        }
+        Ok(sample)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn load(name: &str, overrides: &[Override]) -> Rig {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs").join(name);
+        Rig::load(&path, overrides).expect("a rig file that comes along")
+    }
+
+    #[test]
+    fn devices_without_a_driver_are_named_together_with_the_way_out() {
+        for (key, value, named) in [
+            ("arm.driver", "franka", "franka"),
+            ("base.driver", "tags", "tags"),
+            ("camera.wrist.driver", "realsense", "camera \"wrist\""),
+        ] {
+            let rig = load("static-arm.toml", &[Override::new(key, value)]);
+            let message = format!("{:#}", super::rig(rig, Devices::Real).err().expect("no such driver"));
+            assert!(message.contains(named) && message.contains("--sim"), "{message}");
+        }
+    }
+
+    #[test]
+    fn what_is_no_recording_is_refused() {
+        let missing = recording(Path::new("no/such.mcap"), None, &[]).err().expect("no file");
+        assert!(format!("{missing:#}").contains("no/such.mcap"));
+    }
+
+    #[test]
+    fn a_recording_holds_the_rig_that_made_it() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("run.mcap");
+        let rig = load("two-cameras.toml", &[Override::new("sim.seed", 77)]);
+        let mut recorder = recorder(&path, &rig).expect("a new file");
+        let joints = kinematics::JointState {
+            stamp: kinematics::Stamp(5),
+            position: vec![0.0; 7],
+            velocity: vec![],
+            effort: vec![],
+        };
+        recorder.write(&Sample::Joints(joints.clone())).expect("room on the disk");
+        recorder.finish().expect("room on the disk");
+        let mut opened = recording(&path, None, &[]).expect("a recording");
+        assert_eq!(opened.rig, rig);
+        assert_eq!(opened.source.next_sample().expect("readable"), Some(Sample::Joints(joints)));
+        assert_eq!(opened.source.next_sample().expect("readable"), None);
+        assert_eq!(opened.damage.get(), None);
+        let overridden = recording(&path, None, &[Override::new("train.seed", 9)]).expect("a recording");
+        assert_eq!(overridden.rig.train.seed, 9);
+    }
+}
