@@ -35,7 +35,7 @@ pub(crate) async fn serve(socket: WebSocket, hub: Hub, mut stopped: watch::Recei
             },
             () = wake.notified() => session.send_pictures().await,
             _ = news_due.tick() => session.send_news().await,
-            _ = stopped.changed() => session.part("the server stops").await,
+            _ = stopped.changed() => session.part("the server has stopped").await,
         };
     }
     drop(membership);

@@ -194,7 +194,6 @@ fn check_picture(browser: &mut Browser, request: &RenderRequest) {
     for id in ["toggle-grid", "toggle-frustums"] {
         browser.click(id);
     }
-    std::thread::sleep(Duration::from_millis(300));
     let shot = canvas_shot(browser);
     let expected = draw(request);
     assert_eq!([shot.width(), shot.height()], expected.size_px);
@@ -248,7 +247,7 @@ fn check_drag(browser: &mut Browser, painter: &Painter, before: &RenderRequest) 
 fn check_reconnect(browser: &mut Browser, server: Server, hub: &Hub) {
     let listen = server.address();
     drop(server);
-    wait_for(browser, "the loss", |browser| browser.text("connection").contains("the server stops"));
+    wait_for(browser, "the loss", |browser| browser.text("connection").contains("the server has stopped"));
     let server = Server::start(ServerConfig { listen }, hub.clone()).expect("the port is free again");
     wait_for(browser, "the return", |browser| browser.text("connection").contains("connected"));
     drop(server);
@@ -264,6 +263,7 @@ fn wait_for(browser: &mut Browser, what: &str, mut is_there: impl FnMut(&mut Bro
 
 /// The part of the window that the view covers.
 fn canvas_shot(browser: &mut Browser) -> image::RgbImage {
+    browser.next_frame();
     let bounds = browser.evaluate("(() => { const b = document.getElementById('canvas').getBoundingClientRect(); return [b.x, b.y, b.width, b.height].map(Math.round) })()");
     let bound = |ix: usize| bounds[ix].as_u64().and_then(|n| u32::try_from(n).ok()).expect("a bound");
     let shot = image::load_from_memory_with_format(&browser.screenshot(), image::ImageFormat::Png).expect("a PNG");

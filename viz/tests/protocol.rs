@@ -297,7 +297,7 @@ fn a_stopping_server_says_goodbye_and_frees_the_port() {
     let mut client = Client::connect(address);
     client.settle();
     drop(server);
-    assert_eq!(client.text_of("goodbye")["reason"], json!("the server stops"));
+    assert_eq!(client.text_of("goodbye")["reason"], json!("the server has stopped"));
     assert_eq!(client.receive(), Received::End);
     assert_eq!(hub.n_clients(), 0);
     drop(Server::start(ServerConfig { listen: address }, hub).expect("the port is free again"));

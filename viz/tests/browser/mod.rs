@@ -89,6 +89,12 @@ impl Browser {
         result["result"]["value"].clone()
     }
 
+    /// Waits until all that has happened so far is on screen.
+    pub(crate) fn next_frame(&mut self) {
+        let frames = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))";
+        self.call("Runtime.evaluate", json!({"expression": frames, "awaitPromise": true}));
+    }
+
     /// Text of the element with this id.
     pub(crate) fn text(&mut self, id: &str) -> String {
         let text = self.evaluate(&format!("document.getElementById('{id}')?.textContent ?? ''"));
