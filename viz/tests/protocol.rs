@@ -212,7 +212,7 @@ fn a_malformed_message_gets_a_sentence_and_the_connection_stays() {
         ("[]".to_owned(), Value::Null, "not understood"),
         (json!({"type": "dance"}).to_string(), Value::Null, "dance"),
         (json!({"type": "render", "id": 30}).to_string(), json!(30), "missing field"),
-        (render_message(33).to_string().replace("-2.0", "1e999"), Value::Null, "number out of range"),
+        (render_message(33).to_string().replace("-2.0", "1e999"), json!(33), "number out of range"),
         (wrong_size.to_string(), json!(31), "size_px"),
         (wrong_pose.to_string(), json!(32), "world_from_camera"),
     ];
