@@ -280,6 +280,58 @@ fn live_images_reach_every_client_once_as_jpeg() {
 }
 
 #[test]
+fn every_field_on_the_wire_is_in_the_docs_and_known_to_the_page() {
+    let folder = std::path::PathBuf::from(env!("CARGO_MANIFEST_DIR"));
+    let docs = std::fs::read_to_string(folder.join("../docs/protocol.md")).expect("the docs");
+    let page = std::fs::read_to_string(folder.join("web/src/protocol.ts")).expect("the page's messages");
+    assert!(docs.contains(&format!("Version **{}**", viz::PROTOCOL_VERSION)));
+    assert!(page.contains(&format!("PROTOCOL_VERSION = {};", viz::PROTOCOL_VERSION)));
+    for message in one_of_each() {
+        let kind = message["type"].as_str().expect("a type");
+        let section = section_of(&docs, kind);
+        for name in message.as_object().expect("an object").keys().filter(|name| *name != "type") {
+            assert!(section.contains(&format!("`{name}`")), "{kind}.{name} is not in docs/protocol.md");
+            assert!(page.contains(&format!("{name}:")), "{kind}.{name} is not in web/src/protocol.ts");
+        }
+    }
+}
+
+/// One message of each type that the server sends.
+fn one_of_each() -> Vec<Value> {
+    let (hub, server) = start();
+    hub.set_status(Status::default());
+    hub.set_scene_hint(SceneHint { center_m: [0.0; 3], radius_m: 1.0, world_from_camera: Transform::identity() });
+    hub.set_live_image(LiveImage {
+        camera: "wrist".into(),
+        stamp: Stamp(1),
+        size_px: [8, 8],
+        pixels: LivePixels::Rgb(vec![0; 192].into()),
+        world_from_camera: None,
+        focal_px: [8.0; 2],
+        principal_px: [4.0; 2],
+    });
+    let mut client = Client::connect(server.address());
+    let mut messages = vec![client.text()];
+    messages.extend(["scene", "status", "keyframes"].map(|kind| client.text_of(kind)));
+    messages.push(client.binary_of("live_image").0);
+    client.say(&render_message(1));
+    draw_all(&hub, 1);
+    messages.push(client.binary_of("picture").0);
+    client.say_raw(tungstenite::Message::text("{"));
+    messages.push(client.text_of("error"));
+    drop(server);
+    messages.push(client.text_of("goodbye"));
+    messages
+}
+
+/// The part of the docs about a message of the server.
+fn section_of<'a>(docs: &'a str, kind: &str) -> &'a str {
+    let from_server = &docs[docs.find("## From the server").expect("the chapter")..];
+    let section = from_server.split("\n### ").find(|section| section.starts_with(&format!("`{kind}`")));
+    section.unwrap_or_else(|| panic!("docs/protocol.md has no section about {kind}"))
+}
+
+#[test]
 fn another_version_is_sent_away_and_the_same_is_welcome() {
     let (_hub, server) = start();
     let mut client = Client::connect(server.address());
