@@ -36,7 +36,9 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
     let (mut frames, mut left_out, mut notes) = (Vec::new(), LeftOut::default(), Vec::new());
     for (ix, entry) in document.frames.iter().enumerate() {
         let in_frame = |reason: String| wrong(format!("frame {:?}: {reason}", entry.file_path));
-        let world_from_camera = entry.world_from_camera().map_err(in_frame)?;
+        let world_from_camera = world_from_camera(&entry.transform_matrix).map_err(in_frame)?;
+        let depth_pose =
+            entry.depth_transform_matrix.as_ref().map(self::world_from_camera).transpose().map_err(in_frame)?;
         let Some(image_path) = existing(&folder, &entry.file_path) else {
             left_out.missing.push(entry.file_path.clone());
             continue;
@@ -60,7 +62,11 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
             world_from_camera,
             stamp: Stamp(i64::try_from(ix).unwrap_or(i64::MAX).saturating_mul(1_000_000)),
             image_path,
-            depth: depth_path.map(|path| DepthFile { path, metres_per_count, world_from_camera }),
+            depth: depth_path.map(|path| DepthFile {
+                path,
+                metres_per_count,
+                world_from_camera: depth_pose.unwrap_or(world_from_camera),
+            }),
             mask_path: entry.mask_path.as_ref().map(|name| folder.join(name)),
         });
     }
@@ -86,10 +92,15 @@ struct Entry {
     file_path: String,
     depth_file_path: Option<String>,
     mask_path: Option<String>,
-    transform_matrix: Vec<Vec<Option<f64>>>,
+    transform_matrix: Matrix,
+    /// Our own key: where the depth camera was, when that is not where the photo was taken.
+    depth_transform_matrix: Option<Matrix>,
     #[serde(flatten)]
     camera: Camera,
 }
+
+/// Rows of a pose; null where the file has no finite number.
+type Matrix = Vec<Vec<Option<f64>>>;
 
 /// Lens parameters as the file names them.
 #[derive(Clone, Default, Deserialize)]
@@ -112,23 +123,23 @@ struct Camera {
 }
 
 impl Entry {
-    fn world_from_camera(&self) -> Result<Transform, String> {
-        let rows: Vec<f64> = self.transform_matrix.iter().flatten().map(|value| value.unwrap_or(f64::NAN)).collect();
-        let last_row = [0.0, 0.0, 0.0, 1.0];
-        let rows: [f64; 16] = match rows.len() {
-            12 => [rows.as_slice(), &last_row].concat(),
-            _ => rows,
-        }
-        .try_into()
-        .map_err(|rows: Vec<f64>| format!("transform_matrix has {} numbers, must be 4 rows of 4", rows.len()))?;
-        let world_from_opengl = transform::from_rows(&rows).map_err(|error| error.to_string())?;
-        Ok(world_from_opengl * opengl_from_camera())
-    }
-
     fn lacks_depth(&self, folder: &Path) -> bool {
         let there = |name: &String| existing(folder, name).is_some();
         there(&self.file_path) && self.depth_file_path.as_ref().is_some_and(|name| !there(name))
     }
+}
+
+/// A pose of theirs as one of ours.
+fn world_from_camera(matrix: &Matrix) -> Result<Transform, String> {
+    let mut rows: Vec<f64> = matrix.iter().flatten().map(|value| value.unwrap_or(f64::NAN)).collect();
+    if rows.len() == 12 {
+        rows.extend([0.0, 0.0, 0.0, 1.0]);
+    }
+    let rows: [f64; 16] = rows
+        .try_into()
+        .map_err(|rows: Vec<f64>| format!("transform_matrix has {} numbers, must be 4 rows of 4", rows.len()))?;
+    let world_from_opengl = transform::from_rows(&rows).map_err(|error| error.to_string())?;
+    Ok(world_from_opengl * opengl_from_camera())
 }
 
 /// Half a turn about x: theirs looks along -z with y up, ours along z with y down.

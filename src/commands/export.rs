@@ -1,0 +1,99 @@
+//! `fieldrig export`: models and recordings in the formats of other programs.
+
+use crate::exit::{BadArgument, Exit};
+use crate::export::{Written, write_nerfstudio};
+use crate::join::{Join, KeyframeList};
+use crate::{open, print};
+use anyhow::{Context, ensure};
+use std::path::{Path, PathBuf};
+use trainer::ply;
+
+/// The splats in a model's folder.
+const SPLATS: &str = "splats.ply";
+
+/// Flags of `export`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// A model's folder, or a recording (MCAP)
+    #[arg(value_name = "MODEL|REC")]
+    from: PathBuf,
+    /// What to write
+    #[arg(long, value_enum)]
+    to: Format,
+    /// File (ply) or new folder (nerfstudio) to write
+    #[arg(long, value_name = "PATH")]
+    out: PathBuf,
+    /// Of a recording, export exactly the keyframes this `keyframes.txt` lists [default: those a run would accept]
+    #[arg(long, value_name = "FILE")]
+    keyframes: Option<PathBuf>,
+}
+
+/// Formats there are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Format {
+    /// Of a model: its splats as a .ply that other viewers open
+    Ply,
+    /// Of a recording: a folder with PNG photos, 16-bit depth, transforms.json with poses and split lists
+    Nerfstudio,
+}
+
+/// Writes the model or recording and says what was written; a recording that ends early is a loss.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let is_model = args.from.join(SPLATS).is_file();
+    ensure!(is_model || args.from.is_file(), cannot_export(&args.from));
+    match (args.to, is_model) {
+        (Format::Ply, true) => export_ply(&args.from, &args.out),
+        (Format::Nerfstudio, false) => export_recording(args),
+        (Format::Ply, false) => Err(wrong_kind("ply is written of a model's folder, this is a file", &args.from)),
+        (Format::Nerfstudio, true) => {
+            Err(wrong_kind("nerfstudio is written of a recording, this is a model", &args.from))
+        }
+    }
+}
+
+fn cannot_export(from: &Path) -> BadArgument {
+    BadArgument(format!("{}: neither a folder with {SPLATS} nor a recording", from.display()))
+}
+
+fn wrong_kind(sentence: &str, from: &Path) -> anyhow::Error {
+    BadArgument(format!("{}: {sentence}", from.display())).into()
+}
+
+/// Checks the splats by reading them before they go out.
+fn export_ply(model: &Path, out: &Path) -> anyhow::Result<Exit> {
+    let splats = ply::read(&model.join(SPLATS))?;
+    ply::write(out, &splats)?;
+    print::line(format!("{} splats of colour degree {} -> {}", splats.n_splats(), splats.sh_degree, out.display()))?;
+    Ok(Exit::Done)
+}
+
+fn export_recording(args: &Args) -> anyhow::Result<Exit> {
+    let mut opened = open::recording(&args.from, None, &[])?;
+    let mut join = Join::new(&opened.rig)?;
+    if let Some(list) = &args.keyframes {
+        join = join.taking_only(KeyframeList::load(list)?);
+    }
+    let bar = print::bar(None, "{spinner} reading {pos} samples", false);
+    while let Some(sample) = opened.source.next_sample()? {
+        join.push(sample);
+        bar.inc(1);
+    }
+    join.finish();
+    bar.finish_and_clear();
+    let written = write_nerfstudio(&args.out, join.keyframes().cloned())
+        .with_context(|| format!("cannot export {}", args.from.display()))?;
+    log::info!("{}", join.counts());
+    print::line(format!("{} -> {}", sentence(written), args.out.display()))?;
+    let Some(damage) = opened.damage.get() else { return Ok(Exit::Done) };
+    log::warn!("{damage}");
+    Ok(Exit::Loss)
+}
+
+fn sentence(written: Written) -> String {
+    let Written { n_images, n_depth, n_depth_left_out } = written;
+    let left_out = match n_depth_left_out {
+        0 => String::new(),
+        n => format!(", {n} depth images left out: their lens is not that of their photo"),
+    };
+    format!("{n_images} photos, {n_depth} of them with depth{left_out}")
+}

@@ -1,0 +1,101 @@
+//! `fieldrig metrics`: how near one picture comes to another.
+
+use crate::print;
+use anyhow::{Context, bail};
+use image::DynamicImage;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use trainer::eval::{Lpips, PixelPair, depth_rmse_m, psnr, ssim};
+
+/// Names the weights of LPIPS where the flag does not.
+const LPIPS_WEIGHTS: &str = "FIELDRIG_LPIPS_WEIGHTS";
+
+/// Flags of `metrics`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// The picture to judge (PNG or JPEG)
+    #[arg(value_name = "A")]
+    rendered: PathBuf,
+    /// What it should look like; where this one is transparent, nothing is compared
+    #[arg(value_name = "B")]
+    truth: PathBuf,
+    /// Print one JSON object instead of a line for people; null is what is not known, or for PSNR infinite
+    #[arg(long)]
+    json: bool,
+    /// Weights of LPIPS for SqueezeNet (safetensors) [default: the file named by FIELDRIG_LPIPS_WEIGHTS; none: no LPIPS]
+    #[arg(long, value_name = "FILE")]
+    lpips_weights: Option<PathBuf>,
+    /// Metres per count, when both pictures are 16-bit depth
+    #[arg(long, value_name = "METRES", default_value_t = 0.001)]
+    metres_per_count: f64,
+}
+
+/// What is printed; `None` is not known.
+#[derive(Debug, Default, Serialize)]
+struct Scores {
+    psnr: Option<f64>,
+    ssim: Option<f64>,
+    lpips: Option<f64>,
+    depth_rmse_m: Option<f64>,
+}
+
+/// Prints PSNR, SSIM and LPIPS of two pictures, or the error of two depth images.
+pub(crate) fn run(args: Args) -> anyhow::Result<()> {
+    let (rendered, truth) = (open(&args.rendered)?, open(&args.truth)?);
+    let [size_px, truth_px] = [&rendered, &truth].map(|picture| [picture.width(), picture.height()]);
+    if size_px != truth_px {
+        bail!(
+            "{} is {}x{} pixels, {} is {}x{}: pictures must have one size",
+            args.rendered.display(),
+            size_px[0],
+            size_px[1],
+            args.truth.display(),
+            truth_px[0],
+            truth_px[1]
+        );
+    }
+    let scores = match (rendered, truth) {
+        (DynamicImage::ImageLuma16(rendered), DynamicImage::ImageLuma16(truth)) => {
+            depth_scores([rendered.as_raw(), truth.as_raw()], args.metres_per_count)?
+        }
+        (rendered, truth) => {
+            let (rendered, truth) = (rendered.into_rgba8(), truth.into_rgba8());
+            color_scores(&PixelPair::new(size_px, &rendered, &truth)?, lpips_weights(&args).as_deref())?
+        }
+    };
+    if args.json { print::json(&scores) } else { Ok(print::line(scores.for_people())?) }
+}
+
+fn open(path: &Path) -> anyhow::Result<DynamicImage> {
+    let read = || anyhow::Ok(image::ImageReader::open(path)?.with_guessed_format()?.decode()?);
+    read().with_context(|| format!("cannot read the picture {}", path.display()))
+}
+
+fn lpips_weights(args: &Args) -> Option<PathBuf> {
+    args.lpips_weights.clone().or_else(|| std::env::var_os(LPIPS_WEIGHTS).map(PathBuf::from))
+}
+
+fn color_scores(pair: &PixelPair<'_>, lpips_weights: Option<&Path>) -> anyhow::Result<Scores> {
+    let lpips = lpips_weights.map(|weights| Lpips::load(weights)?.distance(pair)).transpose()?;
+    Ok(Scores { psnr: Some(psnr(pair)?), ssim: Some(ssim(pair)?), lpips, depth_rmse_m: None })
+}
+
+fn depth_scores(counts: [&Vec<u16>; 2], metres_per_count: f64) -> anyhow::Result<Scores> {
+    #[expect(clippy::cast_possible_truncation, reason = "16-bit counts keep more digits in f32 than sensors have")]
+    let metres_from_count = |count: &u16| (f64::from(*count) * metres_per_count) as f32;
+    let [rendered_m, truth_m] = counts.map(|counts| counts.iter().map(metres_from_count).collect::<Vec<_>>());
+    Ok(Scores { depth_rmse_m: depth_rmse_m(&rendered_m, &truth_m)?, ..Scores::default() })
+}
+
+impl Scores {
+    fn for_people(&self) -> String {
+        let parts = [
+            self.psnr.map(|psnr| format!("PSNR {psnr:.3} dB")),
+            self.ssim.map(|ssim| format!("SSIM {ssim:.5}")),
+            self.lpips.map(|lpips| format!("LPIPS {lpips:.5}")),
+            self.depth_rmse_m.map(|rmse_m| format!("depth error {:.2} mm", 1e3 * rmse_m)),
+        ];
+        let known: Vec<_> = parts.into_iter().flatten().collect();
+        if known.is_empty() { "nothing to compare: no pixel has depth in both".to_owned() } else { known.join("  ") }
+    }
+}

@@ -1,0 +1,123 @@
+//! From dataset folders to keyframes.
+
+use super::*;
+use image::{GrayImage, Luma, RgbImage};
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+
+fn shared(name: &str) -> Option<PathBuf> {
+    let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
+    let folder = std::env::var_os("FIELDRIG_TEST_DATA").map_or_else(beside, PathBuf::from).join(name);
+    if !folder.is_dir() {
+        eprintln!("skipped: no test data at {}", folder.display());
+        return None;
+    }
+    Some(folder)
+}
+
+/// A folder with `n` photos of 64 x 48 pixels, brighter to the right, all from one place, through `lens`.
+fn folder_of(n: usize, lens: &Value) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let rows = json!([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]);
+    let mut frames = Vec::new();
+    for ix in 0..n {
+        let name = format!("{ix:02}.png");
+        let photo = RgbImage::from_fn(64, 48, |x, _| image::Rgb([4 * u8::try_from(x).unwrap(), 100, 7]));
+        photo.save(folder.path().join(&name)).unwrap();
+        frames.push(json!({ "file_path": name, "transform_matrix": rows }));
+    }
+    let mut document = json!({ "fl_x": 40.0, "fl_y": 40.0, "cx": 32.0, "cy": 24.0, "frames": frames });
+    document.as_object_mut().unwrap().extend(lens.as_object().unwrap().clone());
+    std::fs::write(folder.path().join("transforms.json"), document.to_string()).unwrap();
+    folder
+}
+
+fn load_at(folder: &Path, scale_frac: f64) -> anyhow::Result<Loaded> {
+    load(&drivers::dataset::read(folder)?, &Holdout::default(), scale_frac, &|_| ())
+}
+
+#[test]
+fn fox_becomes_undistorted_keyframes() {
+    let Some(folder) = shared("fox") else { return };
+    let most_done = AtomicUsize::new(0);
+    let dataset = drivers::dataset::read(&folder).unwrap();
+    let told = |n_done| _ = most_done.fetch_max(n_done, Ordering::Relaxed);
+    let loaded = load(&dataset, &Holdout::default(), 0.25, &told).unwrap();
+    assert_eq!((loaded.keyframes.len(), most_done.into_inner()), (50, 50));
+    assert!(loaded.notes[0].starts_with("17 images"), "{:?}", loaded.notes);
+    let of = |split| loaded.keyframes.iter().filter(|keyframe| keyframe.split == split).count();
+    assert_eq!([of(Split::Test), of(Split::Selection), of(Split::Train)], [7, 6, 37]);
+    let first = &loaded.keyframes[0];
+    assert_eq!((first.size_px, first.focal_px), ([135, 240], [687.76 / 4.0, 687.245 / 4.0]));
+    let unseen = first.rgba_srgb.chunks_exact(4).filter(|pixel| pixel[3] == 0).count();
+    assert!(unseen < 135 * 240 / 20, "{unseen}");
+}
+
+#[test]
+fn redkitchen_keeps_its_depth() {
+    let Some(folder) = shared("redkitchen") else { return };
+    let loaded = load_at(&folder, 0.5).unwrap();
+    let depth = loaded.keyframes[3].depth.as_ref().unwrap();
+    assert_eq!((loaded.keyframes[3].size_px, depth.size_px), ([320, 240], [640, 480]));
+    assert!(depth.depth_m.iter().filter(|&&depth_m| depth_m > 0.0).count() > 100_000);
+}
+
+#[test]
+fn a_fisheye_photo_is_undistorted_and_what_it_lacks_is_masked() {
+    let folder = folder_of(3, &json!({ "camera_model": "OPENCV_FISHEYE", "k1": 0.3 }));
+    let keyframe = load_at(folder.path(), 1.0).unwrap().keyframes[0].clone();
+    let pixel = |x: usize, y: usize| &keyframe.rgba_srgb[4 * (y * 64 + x)..][..4];
+    assert_eq!(pixel(32, 24)[3], 255);
+    // Seven pixels right of the centre, the fisheye with this k1 shows what a pinhole shows at most a pixel off.
+    assert!(pixel(39, 24)[0].abs_diff(4 * 39) <= 4, "{:?}", pixel(39, 24));
+    // With a strong k1 the corner of the pinhole image lies outside the photo: theta_d exceeds its half diagonal.
+    let strong = folder_of(3, &json!({ "camera_model": "OPENCV_FISHEYE", "k1": 2.0 }));
+    let keyframe = load_at(strong.path(), 1.0).unwrap().keyframes[0].clone();
+    assert_eq!(keyframe.rgba_srgb[3], 0);
+}
+
+#[test]
+fn scaling_averages_areas_and_masks_what_is_partly_masked() {
+    let folder = folder_of(2, &json!({ "mask_path": null }));
+    let text = std::fs::read_to_string(folder.path().join("transforms.json")).unwrap();
+    let mut document: Value = serde_json::from_str(&text).unwrap();
+    for frame in document["frames"].as_array_mut().unwrap() {
+        frame["mask_path"] = json!("mask.png");
+    }
+    std::fs::write(folder.path().join("transforms.json"), document.to_string()).unwrap();
+    GrayImage::from_fn(64, 48, |x, _| Luma([if x == 3 { 0 } else { 255 }]))
+        .save(folder.path().join("mask.png"))
+        .unwrap();
+    let keyframe = load_at(folder.path(), 0.5).unwrap().keyframes[1].clone();
+    let row: Vec<[u8; 4]> = keyframe.rgba_srgb.as_chunks::<4>().0[..32].to_vec();
+    // Columns 0 and 1 hold 0 and 4; column 1 of the small picture covers the masked one.
+    assert_eq!((row[0], row[1][3], row[2]), ([2, 100, 7, 255], 0, [18, 100, 7, 255]));
+    assert_eq!((keyframe.size_px, keyframe.principal_px), ([32, 24], [16.0, 12.0]));
+    assert!(load_at(folder.path(), 0.0).unwrap_err().to_string().contains("--scale 0"));
+}
+
+#[test]
+fn fractions_of_pixels_count_by_their_area() {
+    let shares = coverage(5, 2);
+    assert_eq!(shares[0], [(0, 0.4), (1, 0.4), (2, 0.2)]);
+    assert_eq!(shares[1], [(2, 0.2), (3, 0.4), (4, 0.4)]);
+}
+
+#[test]
+fn photos_that_break_off_are_left_out_with_their_names() {
+    let folder = folder_of(10, &json!({}));
+    let truncate = |name: &str| {
+        let path = folder.path().join(name);
+        let bytes = std::fs::read(&path).unwrap();
+        std::fs::write(path, &bytes[..bytes.len() / 2]).unwrap();
+    };
+    truncate("03.png");
+    let loaded = load_at(folder.path(), 1.0).unwrap();
+    assert_eq!((loaded.keyframes.len(), loaded.names.contains(&"03.png".to_owned())), (9, false));
+    assert!(loaded.notes[0].contains("1 images cannot be used") && loaded.notes[0].contains("03.png"));
+    // The others keep the split they had.
+    assert_eq!(loaded.keyframes[7].split, Split::Test);
+    (0..10).for_each(|ix| truncate(&format!("{ix:02}.png")));
+    let text = load_at(folder.path(), 1.0).unwrap_err().to_string();
+    assert!(text.contains("no photo to train on can be used"), "{text}");
+}

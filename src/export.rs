@@ -1,0 +1,239 @@
+//! Keyframes -> a nerfstudio folder: PNG colour, 16-bit depth, poses, split lists.
+
+use anyhow::{Context, ensure};
+use drivers::dataset::nerfstudio;
+use image::ExtendedColorType;
+use kinematics::{Transform, transform};
+use serde_json::{Map, Value, json};
+use std::path::Path;
+use std::sync::Arc;
+use trainer::{DepthMap, Keyframe, Split};
+
+/// What readers assume where a file does not say: millimetres.
+const METRES_PER_COUNT: f64 = 0.001;
+/// Depth may be written as that of a photo when their lenses differ by less than this, in pixels of the depth image.
+const SAME_LENS_PX: f64 = 0.5;
+/// The test photos, one a line, as `--holdout` takes them.
+const TEST_LIST: &str = "test.txt";
+/// The lists of nerfstudio; its validation photos are our selection.
+const LISTS: [(&str, Split); 3] =
+    [("train_filenames", Split::Train), ("val_filenames", Split::Selection), ("test_filenames", Split::Test)];
+
+/// What was written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Written {
+    pub(crate) n_images: usize,
+    pub(crate) n_depth: usize,
+    /// Depth images left out because their lens is not that of their photo, which the format cannot say.
+    pub(crate) n_depth_left_out: usize,
+}
+
+/// Writes a folder that must not hold a dataset yet; `transforms.json` comes last, so a folder that has it is whole.
+///
+/// Depth is rounded to millimetres and ends at 65 m. Velocities, readout times and the truth of simulators have no place in it.
+pub(crate) fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<Keyframe>>) -> anyhow::Result<Written> {
+    let transforms = out.join(nerfstudio::FILE_NAME);
+    ensure!(!transforms.exists(), "{} is there already: name another folder", transforms.display());
+    let mut written = Written::default();
+    let (mut cameras, mut frames, mut splits) = (Vec::new(), Vec::new(), Vec::new());
+    for keyframe in keyframes {
+        frames.push(write_frame(out, &keyframe, &mut written)?);
+        cameras.push(camera_keys(&keyframe));
+        splits.push(keyframe.split);
+    }
+    ensure!(!frames.is_empty(), "there is no keyframe to export");
+
+    let names = |wanted: Split| {
+        let of_split = frames.iter().zip(&splits).filter(move |(_, split)| **split == wanted);
+        of_split.filter_map(|(frame, _)| frame["file_path"].as_str().map(str::to_owned)).collect::<Vec<_>>()
+    };
+    write_text(&out.join(TEST_LIST), &(names(Split::Test).join("\n") + "\n"))?;
+    let mut document = Map::new();
+    document.insert("camera_model".to_owned(), json!("PINHOLE"));
+    document.insert("depth_unit_scale_factor".to_owned(), json!(METRES_PER_COUNT));
+    document.extend(LISTS.map(|(key, split)| (key.to_owned(), json!(names(split)))));
+    // One camera stands once, at the top, where every reader looks; several stand with their frames.
+    if cameras.iter().all(|camera| *camera == cameras[0]) {
+        document.append(&mut cameras[0]);
+    } else {
+        frames.iter_mut().zip(&mut cameras).for_each(|(frame, camera)| frame.append(camera));
+    }
+    document.insert("frames".to_owned(), json!(frames));
+    write_text(&transforms, &serde_json::to_string_pretty(&document)?)?;
+    Ok(written)
+}
+
+/// Writes the pictures of one keyframe and tells its entry.
+fn write_frame(out: &Path, keyframe: &Keyframe, written: &mut Written) -> anyhow::Result<Map<String, Value>> {
+    let name = format!("{}_{:020}.png", keyframe.camera, keyframe.stamp.0);
+    let mut frame = Map::new();
+    let mut insert = |key: &str, value: Value| frame.insert(key.to_owned(), value);
+    insert("file_path", json!(format!("images/{name}")));
+    insert("transform_matrix", opengl_rows(&keyframe.world_from_camera));
+
+    let pixels = keyframe.rgba_srgb.as_chunks::<4>().0;
+    let rgb: Vec<u8> = pixels.iter().flat_map(|&[red, green, blue, _]| [red, green, blue]).collect();
+    write_png(&out.join("images").join(&name), keyframe.size_px, &rgb, ExtendedColorType::Rgb8)?;
+    written.n_images += 1;
+    if pixels.iter().any(|pixel| pixel[3] == 0) {
+        let mask: Vec<u8> = pixels.iter().map(|pixel| pixel[3]).collect();
+        write_png(&out.join("masks").join(&name), keyframe.size_px, &mask, ExtendedColorType::L8)?;
+        insert("mask_path", json!(format!("masks/{name}")));
+    }
+    match &keyframe.depth {
+        Some(depth) if has_lens_of(depth, keyframe) => {
+            write_png(&out.join("depth").join(&name), depth.size_px, &depth_counts(depth), ExtendedColorType::L16)?;
+            insert("depth_file_path", json!(format!("depth/{name}")));
+            if depth.world_from_camera != keyframe.world_from_camera {
+                insert("depth_transform_matrix", opengl_rows(&depth.world_from_camera));
+            }
+            written.n_depth += 1;
+        }
+        Some(_) => written.n_depth_left_out += 1,
+        None => {}
+    }
+    Ok(frame)
+}
+
+/// Size and lens of a keyframe under nerfstudio's keys.
+fn camera_keys(keyframe: &Keyframe) -> Map<String, Value> {
+    let [[width, height], [fl_x, fl_y], [cx, cy]] =
+        [keyframe.size_px.map(f64::from), keyframe.focal_px, keyframe.principal_px];
+    let keys =
+        [("fl_x", fl_x), ("fl_y", fl_y), ("cx", cx), ("cy", cy)].map(|(key, value)| (key.to_owned(), json!(value)));
+    let size = [("w", width), ("h", height)].map(|(key, value)| (key.to_owned(), json!(value as u32)));
+    keys.into_iter().chain(size).collect()
+}
+
+/// The pose as four rows, for a camera that looks along -z with y up.
+fn opengl_rows(world_from_camera: &Transform) -> Value {
+    // Half a turn is its own inverse.
+    let rows = transform::to_rows(&(world_from_camera * nerfstudio::opengl_from_camera()));
+    json!(rows.as_chunks::<4>().0)
+}
+
+/// Whether the depth image is seen through the photo's lens, at its own size.
+fn has_lens_of(depth: &DepthMap, keyframe: &Keyframe) -> bool {
+    (0..2).all(|axis| {
+        let ratio = f64::from(depth.size_px[axis]) / f64::from(keyframe.size_px[axis]);
+        let focal_off = depth.focal_px[axis] - ratio * keyframe.focal_px[axis];
+        let principal_off = depth.principal_px[axis] - ratio * keyframe.principal_px[axis];
+        focal_off.abs() < SAME_LENS_PX && principal_off.abs() < SAME_LENS_PX
+    })
+}
+
+/// Millimetres in the byte order of this machine, as the encoder wants them; 0 where unknown or too far.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the range is checked first")]
+fn depth_counts(depth: &DepthMap) -> Vec<u8> {
+    let count = |depth_m: &f32| {
+        let count = (f64::from(*depth_m) / METRES_PER_COUNT).round();
+        if (0.0..=f64::from(u16::MAX)).contains(&count) { count as u16 } else { 0 }
+    };
+    depth.depth_m.iter().flat_map(|depth_m| count(depth_m).to_ne_bytes()).collect()
+}
+
+fn write_png(path: &Path, size_px: [u32; 2], bytes: &[u8], color: ExtendedColorType) -> anyhow::Result<()> {
+    let write = || {
+        path.parent().map_or(Ok(()), std::fs::create_dir_all)?;
+        image::save_buffer(path, bytes, size_px[0], size_px[1], color)
+    };
+    write().with_context(|| format!("cannot write {}", path.display()))
+}
+
+fn write_text(path: &Path, text: &str) -> anyhow::Result<()> {
+    std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset;
+    use crate::holdout::Holdout;
+    use kinematics::Stamp;
+    use nalgebra::{UnitQuaternion, Vector3};
+
+    /// A keyframe of 32 x 24 pixels with depth.
+    fn keyframe(ix: usize) -> Keyframe {
+        let turn = UnitQuaternion::from_euler_angles(0.1 * ix as f64, 0.2, -1.0);
+        let world_from_camera = Transform::from_parts(Vector3::new(ix as f64, 2.0, 3.0).into(), turn);
+        let pixels = (0..32 * 24).flat_map(|pixel_ix: usize| [(pixel_ix % 251) as u8, ix as u8, 9, 255]);
+        let depth = DepthMap {
+            size_px: [16, 12],
+            focal_px: [15.0, 15.5],
+            principal_px: [8.0, 6.5],
+            depth_m: (0..16 * 12).map(|pixel_ix| pixel_ix as f32 * 0.011).collect(),
+            world_from_camera,
+        };
+        Keyframe {
+            camera: "wrist".into(),
+            stamp: Stamp(1_000_000_000 * (ix as i64 + 1)),
+            size_px: [32, 24],
+            focal_px: [30.0, 31.0],
+            principal_px: [16.0, 13.0],
+            rgba_srgb: pixels.collect(),
+            depth: Some(depth),
+            world_from_camera,
+            twist: None,
+            readout_secs: 0.0,
+            split: Split::of(ix),
+            truth: None,
+        }
+    }
+
+    fn read_back(out: &Path) -> Vec<Arc<Keyframe>> {
+        let dataset = drivers::dataset::read(out).unwrap();
+        assert!(dataset.notes.is_empty(), "{:?}", dataset.notes);
+        let holdout = Holdout::from_argument(out.join(TEST_LIST).to_str().unwrap()).unwrap();
+        dataset::load(&dataset, &holdout, 1.0, &|_| ()).unwrap().keyframes
+    }
+
+    #[test]
+    fn keyframes_survive_a_round_trip() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("out");
+        let mut keyframes: Vec<_> = (0..10).map(keyframe).collect();
+        let mut masked = keyframes[3].rgba_srgb.to_vec();
+        masked[7] = 0;
+        keyframes[3].rgba_srgb = masked.into();
+        let later = Transform::translation(0.001, 0.0, 0.0) * keyframes[5].world_from_camera;
+        keyframes[5].depth.as_mut().unwrap().world_from_camera = later;
+        let written = write_nerfstudio(&out, keyframes.iter().cloned().map(Arc::new)).unwrap();
+        assert_eq!(written, Written { n_images: 10, n_depth: 10, n_depth_left_out: 0 });
+        for (got, expected) in read_back(&out).iter().zip(&keyframes) {
+            assert_eq!(
+                (got.size_px, got.focal_px, got.principal_px),
+                (expected.size_px, expected.focal_px, expected.principal_px)
+            );
+            assert!(got.rgba_srgb == expected.rgba_srgb, "colours differ");
+            assert_eq!(got.split == Split::Test, expected.split == Split::Test);
+            assert!((got.world_from_camera.inverse() * expected.world_from_camera).to_homogeneous().is_identity(1e-12));
+            let (got, expected) = (got.depth.as_ref().unwrap(), expected.depth.as_ref().unwrap());
+            assert_eq!((got.size_px, got.focal_px), (expected.size_px, expected.focal_px));
+            assert!(got.depth_m.iter().zip(expected.depth_m.iter()).all(|(a, b)| (a - b).abs() < 1e-6));
+            assert!((got.world_from_camera.inverse() * expected.world_from_camera).to_homogeneous().is_identity(1e-12));
+        }
+    }
+
+    #[test]
+    fn cameras_of_two_sizes_stand_with_their_frames() {
+        let folder = tempfile::tempdir().unwrap();
+        let (first, mut second) = (keyframe(1), keyframe(2));
+        second.camera = "overview".into();
+        second.size_px = [24, 32];
+        second.depth.as_mut().unwrap().focal_px = [40.0, 40.0];
+        let written = write_nerfstudio(folder.path(), [first, second].map(Arc::new).into_iter()).unwrap();
+        assert_eq!(written, Written { n_images: 2, n_depth: 1, n_depth_left_out: 1 });
+        let sizes: Vec<_> =
+            drivers::dataset::read(folder.path()).unwrap().frames.iter().map(|f| f.intrinsics.size_px).collect();
+        assert_eq!(sizes, [[24, 32], [32, 24]]);
+    }
+
+    #[test]
+    fn nothing_is_overwritten_and_nothing_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        assert!(write_nerfstudio(folder.path(), std::iter::empty()).unwrap_err().to_string().contains("no keyframe"));
+        write_nerfstudio(folder.path(), std::iter::once(Arc::new(keyframe(0)))).unwrap();
+        let again = write_nerfstudio(folder.path(), std::iter::once(Arc::new(keyframe(0)))).unwrap_err();
+        assert!(again.to_string().contains("is there already"), "{again}");
+    }
+}

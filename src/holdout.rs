@@ -1,0 +1,114 @@
+//! Which photos of a dataset are kept from training, and what for.
+
+use anyhow::{Context, ensure};
+use std::path::Path;
+use trainer::Split;
+
+/// How test photos are chosen.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Holdout {
+    /// Every n-th photo there is, from the first; n is at least 2.
+    Every(usize),
+    /// The photos of these names.
+    Named(Vec<String>),
+}
+
+impl Default for Holdout {
+    fn default() -> Self {
+        Self::Every(8)
+    }
+}
+
+impl Holdout {
+    /// From the value of `--holdout`: a number, or a file with one name a line.
+    pub(crate) fn from_argument(argument: &str) -> anyhow::Result<Self> {
+        if let Ok(every) = argument.parse() {
+            ensure!(every >= 2, "--holdout {every}: every {every}. photo leaves none to train on, must be at least 2");
+            return Ok(Self::Every(every));
+        }
+        let text = std::fs::read_to_string(Path::new(argument))
+            .with_context(|| format!("--holdout {argument}: neither a number nor a file that can be read"))?;
+        let names: Vec<_> = text.lines().map(str::trim).filter(|name| !name.is_empty()).map(str::to_owned).collect();
+        ensure!(!names.is_empty(), "--holdout {argument}: the file names no photo");
+        Ok(Self::Named(names))
+    }
+
+    /// What each photo is for, in the order of `names`.
+    ///
+    /// Selection photos lie halfway between test photos; with named test photos they are every 8th of the others, from the 5th.
+    /// A name matches with its folder and extension or without; one that matches nothing is an error.
+    pub(crate) fn splits(&self, names: &[&str]) -> anyhow::Result<Vec<Split>> {
+        let splits = match self {
+            Self::Every(every) => (0..names.len()).map(|ix| every_nth(ix, *every)).collect(),
+            Self::Named(test_names) => named(test_names, names)?,
+        };
+        ensure!(splits.contains(&Split::Train), "no photo is left to train on: {} are held out", names.len());
+        Ok(splits)
+    }
+}
+
+fn every_nth(ix: usize, every: usize) -> Split {
+    match ix % every {
+        0 => Split::Test,
+        place if every >= 4 && place == every / 2 => Split::Selection,
+        _ => Split::Train,
+    }
+}
+
+fn named(test_names: &[String], names: &[&str]) -> anyhow::Result<Vec<Split>> {
+    for test_name in test_names {
+        ensure!(names.iter().any(|name| is_called(name, test_name)), "--holdout: no photo is called {test_name:?}");
+    }
+    let mut n_others = 0;
+    let split = |name: &&str| {
+        if test_names.iter().any(|test_name| is_called(name, test_name)) {
+            return Split::Test;
+        }
+        n_others += 1;
+        if n_others % 8 == 5 { Split::Selection } else { Split::Train }
+    };
+    Ok(names.iter().map(split).collect())
+}
+
+/// Whether a photo is meant: by its path in the folder, its file name, or its file name without extension.
+fn is_called(name: &str, wanted: &str) -> bool {
+    let path = Path::new(name);
+    let parts = [path.file_name(), path.file_stem()];
+    name == wanted || parts.into_iter().flatten().any(|part| part == wanted)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use Split::{Selection, Test, Train};
+
+    #[test]
+    fn every_eighth_is_the_rule_of_keyframes() {
+        let names = vec!["photo"; 20];
+        let expected: Vec<_> = (0..20).map(Split::of).collect();
+        assert_eq!(Holdout::default().splits(&names).unwrap(), expected);
+        assert_eq!(Holdout::Every(2).splits(&names[..4]).unwrap(), [Test, Train, Test, Train]);
+        assert_eq!(Holdout::Every(4).splits(&names[..5]).unwrap(), [Test, Train, Selection, Train, Test]);
+    }
+
+    #[test]
+    fn photos_may_be_named_with_or_without_folder_and_extension() {
+        let names = ["images/a.jpg", "images/b.jpg", "images/c.jpg", "images/d.jpg"];
+        let named = |test: &[&str]| Holdout::Named(test.iter().map(|name| (*name).to_owned()).collect()).splits(&names);
+        assert_eq!(named(&["images/a.jpg", "b.jpg", "c"]).unwrap(), [Test, Test, Test, Train]);
+        assert!(named(&["e"]).unwrap_err().to_string().contains("no photo is called \"e\""));
+        assert!(named(&["a", "b", "c", "d"]).unwrap_err().to_string().contains("no photo is left"));
+    }
+
+    #[test]
+    fn the_argument_is_a_number_or_a_file() {
+        assert_eq!(Holdout::from_argument("10").unwrap(), Holdout::Every(10));
+        assert!(Holdout::from_argument("1").unwrap_err().to_string().contains("at least 2"));
+        assert!(Holdout::from_argument("no/such/file").is_err());
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("test.txt");
+        std::fs::write(&file, "a.jpg\n\n b.jpg \n").unwrap();
+        let names = vec!["a.jpg".to_owned(), "b.jpg".to_owned()];
+        assert_eq!(Holdout::from_argument(file.to_str().unwrap()).unwrap(), Holdout::Named(names));
+    }
+}
