@@ -27,6 +27,9 @@ pub trait Method {
     /// Forgets the keyframe of this camera and stamp, if it is held.
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error>;
     /// Queues at most `n` optimiser updates, few enough to hold the GPU for no more than 20 ms, and says how many.
+    ///
+    /// A queued update is lost, and done again later, when it turns out that a buffer was too small. When all `n` were
+    /// queued the call waits for them, so that [`Method::progress`] is exact; loop until it has reached the step you want.
     fn step(&mut self, n: u64) -> Result<u64, Error>;
     /// Draws a picture; works from the first keyframe on.
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error>;

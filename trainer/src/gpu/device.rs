@@ -149,13 +149,21 @@ impl Gpu {
         self.queue.submit([encoder.finish()]);
     }
 
-    /// Waits for the GPU and reads `bytes` bytes from the start of `buffer`.
+    /// Waits for the GPU and reads the first `n` elements of `buffer`.
     pub fn read<T: bytemuck::Pod>(&self, buffer: &Buffer, n: usize) -> Result<Vec<T>, Error> {
-        let bytes = (n * size_of::<T>()) as u64;
-        if bytes == 0 {
+        if n == 0 {
             return Ok(Vec::new());
         }
-        let padded = bytes.next_multiple_of(4);
+        self.begin_read_bytes(buffer, n * size_of::<T>()).finish(self)
+    }
+
+    /// Begins to read the first `n` words of `buffer` as they are after everything submitted so far.
+    pub fn begin_read(&self, buffer: &Buffer, n: usize) -> PendingRead {
+        self.begin_read_bytes(buffer, 4 * n)
+    }
+
+    fn begin_read_bytes(&self, buffer: &Buffer, n_bytes: usize) -> PendingRead {
+        let padded = (n_bytes as u64).next_multiple_of(4);
         let staging = self.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some("readback"),
             size: padded,
@@ -164,16 +172,13 @@ impl Gpu {
         });
         let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         encoder.copy_buffer_to_buffer(&buffer.raw, 0, &staging, 0, padded);
-        self.queue.submit([encoder.finish()]);
-        let (sender, receiver) = std::sync::mpsc::sync_channel(1);
+        let submission = self.queue.submit([encoder.finish()]);
+        let (sender, mapped) = std::sync::mpsc::sync_channel(1);
         staging.map_async(wgpu::MapMode::Read, .., move |result| {
-            // The receiver lives until the result is there, unless this thread is unwinding.
+            // Nobody listens any more when the read was given up.
             let _ = sender.send(result);
         });
-        self.wait()?;
-        receiver.recv().map_err(|_| Error::DeviceLost)?.map_err(|_| Error::DeviceLost)?;
-        let view = staging.get_mapped_range(..).map_err(|_| Error::DeviceLost)?;
-        Ok(bytemuck::pod_collect_to_vec(&view[..usize::try_from(bytes).map_err(|_| Error::DeviceLost)?]))
+        PendingRead { staging, submission, mapped, n_bytes }
     }
 
     /// Waits until everything submitted is done.
@@ -191,6 +196,26 @@ impl Gpu {
         let live = self.live_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes;
         self.peak_bytes.fetch_max(live, Ordering::Relaxed);
         Buffer { id: self.fresh_id(), raw, bytes, live_bytes: self.live_bytes.clone() }
+    }
+}
+
+/// A read-back under way.
+#[derive(Debug)]
+pub struct PendingRead {
+    staging: wgpu::Buffer,
+    submission: wgpu::SubmissionIndex,
+    mapped: std::sync::mpsc::Receiver<Result<(), wgpu::BufferAsyncError>>,
+    n_bytes: usize,
+}
+
+impl PendingRead {
+    /// Waits for the data.
+    pub fn finish<T: bytemuck::Pod>(self, gpu: &Gpu) -> Result<Vec<T>, Error> {
+        let wait = wgpu::PollType::Wait { submission_index: Some(self.submission), timeout: None };
+        gpu.device.poll(wait).map_err(|_| Error::DeviceLost)?;
+        self.mapped.recv().map_err(|_| Error::DeviceLost)?.map_err(|_| Error::DeviceLost)?;
+        let view = self.staging.get_mapped_range(..).map_err(|_| Error::DeviceLost)?;
+        Ok(bytemuck::pod_collect_to_vec(&view[..self.n_bytes]))
     }
 }
 

@@ -7,7 +7,7 @@ mod pod;
 mod requirements;
 mod wgsl;
 
-pub use device::{Buffer, Gpu, GpuOptions};
+pub use device::{Buffer, Gpu, GpuOptions, PendingRead};
 pub use passes::{PassTiming, Passes};
 pub use pipeline::{Kernel, Pipeline};
 pub use pod::{f32_of, f32s_of};

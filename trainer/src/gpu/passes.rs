@@ -106,20 +106,35 @@ impl Passes {
     /// Sends the list to the GPU and empties it.
     pub fn submit(&mut self, gpu: &Gpu) {
         let mut encoder = gpu.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
-        let mut passes = self.list.drain(..).peekable();
-        while let Some(pass) = passes.next() {
-            match pass {
-                Pass::Clear { buffer } => encoder.clear_buffer(&buffer, 0, None),
-                first @ Pass::Dispatch { .. } => {
-                    let mut compute = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
-                    encode(&mut compute, &first);
-                    while let Some(next) = passes.next_if(|pass| matches!(pass, Pass::Dispatch { .. })) {
-                        encode(&mut compute, &next);
-                    }
-                }
-            }
+        encode_all(&mut encoder, self.list.drain(..));
+        gpu.queue.submit([encoder.finish()]);
+    }
+
+    /// Sends the list, waits, and tells the GPU time from the first pass's beginning to the last one's end, milliseconds.
+    ///
+    /// `None` when the adapter has no timestamps.
+    pub fn submit_spanned(&mut self, gpu: &Gpu) -> Result<Option<f64>, Error> {
+        let timed = gpu.optional.timestamps;
+        let queries = timed.then(|| gpu.device.create_query_set(&wgpu::QuerySetDescriptor { label: Some("span"), ty: wgpu::QueryType::Timestamp, count: 2 }));
+        let stamps = gpu.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("span"),
+            size: 16,
+            usage: wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC,
+            mapped_at_creation: false,
+        });
+        let copy = gpu.storage("span.copy", 16)?;
+        let mut encoder = gpu.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        mark(&mut encoder, queries.as_ref(), true);
+        encode_all(&mut encoder, self.list.drain(..));
+        mark(&mut encoder, queries.as_ref(), false);
+        if let Some(queries) = &queries {
+            encoder.resolve_query_set(queries, 0..2, &stamps, 0);
+            encoder.copy_buffer_to_buffer(&stamps, 0, &copy.raw, 0, 16);
         }
         gpu.queue.submit([encoder.finish()]);
+        gpu.wait()?;
+        let ticks: Vec<u64> = gpu.read(&copy, 2)?;
+        Ok(timed.then(|| ticks[1].saturating_sub(ticks[0]) as f64 * f64::from(gpu.queue.get_timestamp_period()) / 1e6))
     }
 
     /// Sends the list, one timestamped pass a kernel, waits, and tells the GPU time of each.
@@ -168,6 +183,33 @@ impl Passes {
         let nanos_per_tick = f64::from(gpu.queue.get_timestamp_period());
         let millis = |span: &[u64]| span[1].saturating_sub(span[0]) as f64 * nanos_per_tick / 1e6;
         Ok(names.into_iter().zip(ticks.chunks_exact(2)).map(|(name, span)| PassTiming { name, millis: millis(span) }).collect())
+    }
+}
+
+/// An empty pass that writes one timestamp at its beginning or end.
+fn mark(encoder: &mut wgpu::CommandEncoder, queries: Option<&wgpu::QuerySet>, first: bool) {
+    let Some(query_set) = queries else { return };
+    let timestamp_writes = Some(wgpu::ComputePassTimestampWrites {
+        query_set,
+        beginning_of_pass_write_index: first.then_some(0),
+        end_of_pass_write_index: (!first).then_some(1),
+    });
+    drop(encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some("mark"), timestamp_writes }));
+}
+
+fn encode_all(encoder: &mut wgpu::CommandEncoder, list: impl Iterator<Item = Pass>) {
+    let mut passes = list.peekable();
+    while let Some(pass) = passes.next() {
+        match pass {
+            Pass::Clear { buffer } => encoder.clear_buffer(&buffer, 0, None),
+            first @ Pass::Dispatch { .. } => {
+                let mut compute = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
+                encode(&mut compute, &first);
+                while let Some(next) = passes.next_if(|pass| matches!(pass, Pass::Dispatch { .. })) {
+                    encode(&mut compute, &next);
+                }
+            }
+        }
     }
 }
 

@@ -18,6 +18,7 @@ pub(crate) struct SplatBuffers {
     pub(crate) n_splats: u32,
     pub(crate) capacity: u32,
     pub(crate) sh_degree: u32,
+    active_degree: u32,
     pub(crate) model: Buffer,
     pub(crate) means: Buffer,
     pub(crate) rotations: Buffer,
@@ -41,6 +42,7 @@ impl SplatBuffers {
             n_splats: 0,
             capacity,
             sh_degree,
+            active_degree: sh_degree,
             model: gpu.uniform_with("splat.model", &model),
             means: gpu.storage("splat.means", 16 * n)?,
             rotations: gpu.storage("splat.rotations", 16 * n)?,
@@ -68,6 +70,7 @@ impl SplatBuffers {
                 gpu.copy((from, plane * stride_from * bytes), (to, plane * stride_to * bytes), u64::from(self.n_splats) * bytes);
             }
         }
+        larger.active_degree = self.active_degree;
         larger.set_n(gpu, self.n_splats);
         Ok(larger)
     }
@@ -75,7 +78,20 @@ impl SplatBuffers {
     /// Says how many splats there are.
     pub(crate) fn set_n(&mut self, gpu: &Gpu, n_splats: u32) {
         self.n_splats = n_splats;
-        let model = Model { n_splats, capacity: self.capacity, sh_degree: self.sh_degree, n_sh_rest: n_sh_rest(self.sh_degree) };
+        self.write_model(gpu);
+    }
+
+    /// Says which degree of spherical harmonics is in use; there is memory for `sh_degree`.
+    pub(crate) fn set_active_degree(&mut self, gpu: &Gpu, degree: u32) {
+        if self.active_degree != degree.min(self.sh_degree) {
+            self.active_degree = degree.min(self.sh_degree);
+            self.write_model(gpu);
+        }
+    }
+
+    fn write_model(&self, gpu: &Gpu) {
+        let (sh_degree, n_sh_rest) = (self.active_degree, n_sh_rest(self.active_degree));
+        let model = Model { n_splats: self.n_splats, capacity: self.capacity, sh_degree, n_sh_rest };
         gpu.write(&self.model, 0, bytemuck::bytes_of(&model));
     }
 

@@ -11,7 +11,7 @@ macro_rules! shared {
     };
 }
 
-const SHARED: &[Source] = shared!("view", "status", "projection", "tiles", "model", "sh", "scan", "random", "supervision");
+const SHARED: &[Source] = shared!("view", "status", "projection", "tiles", "model", "sh", "scan", "random", "supervision", "growth", "scan_f32");
 const SHARED_WITHOUT_SUBGROUPS: &[Source] = &[
     Source { name: "handover", text: include_str!("../shared/handover_memory.wgsl") },
     SHARED[0],
@@ -48,6 +48,10 @@ pub const KERNELS: &[Kernel] = &[
     BACKWARD_WITHOUT_SUBGROUPS,
     kernel!("update"),
     kernel!("advance"),
+    kernel!("grow_weigh"),
+    kernel!("grow_scan"),
+    kernel!("grow_child"),
+    kernel!("grow_parent"),
 ];
 
 /// What drawing needs.
@@ -90,6 +94,10 @@ pub(crate) struct LearnPipelines {
     pub(crate) backward: Pipeline,
     pub(crate) update: Pipeline,
     pub(crate) advance: Pipeline,
+    pub(crate) grow_weigh: Pipeline,
+    pub(crate) grow_scan: Pipeline,
+    pub(crate) grow_child: Pipeline,
+    pub(crate) grow_parent: Pipeline,
 }
 
 impl LearnPipelines {
@@ -104,6 +112,10 @@ impl LearnPipelines {
             backward: Pipeline::new(gpu, backward, &[("LANES", lanes.into())])?,
             update: Pipeline::new(gpu, kernel!("update"), &[])?,
             advance: Pipeline::new(gpu, kernel!("advance"), &[])?,
+            grow_weigh: Pipeline::new(gpu, kernel!("grow_weigh"), &[])?,
+            grow_scan: Pipeline::new(gpu, kernel!("grow_scan"), &[])?,
+            grow_child: Pipeline::new(gpu, kernel!("grow_child"), &[])?,
+            grow_parent: Pipeline::new(gpu, kernel!("grow_parent"), &[])?,
         })
     }
 

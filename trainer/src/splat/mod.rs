@@ -3,9 +3,20 @@
 #[cfg(test)]
 mod against_twin;
 pub mod arrays;
+pub mod bench;
 mod buffers;
 pub mod cloud;
+mod equirect;
 pub mod kernels;
+#[cfg(test)]
+mod learning;
+mod options;
 mod params;
 mod passes;
 pub mod reference;
+mod seed;
+mod trainer;
+mod views;
+
+pub use options::SplatOptions;
+pub use trainer::SplatTrainer;

@@ -146,3 +146,17 @@ pub(crate) mod status {
     /// Length of the array.
     pub(crate) const LEN: usize = 16;
 }
+
+/// `Growth` of shared/growth.wgsl.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct Growth {
+    pub(crate) n_before: u32,
+    pub(crate) n_after: u32,
+    pub(crate) key: u32,
+    pub(crate) capacity: u32,
+    pub(crate) n_sh_rest: u32,
+    pub(crate) child_spread: f32,
+    pub(crate) child_log_scale: f32,
+    pub(crate) least_opacity: f32,
+}

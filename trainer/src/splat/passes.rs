@@ -2,6 +2,7 @@
 
 use super::buffers::{Frame, Scratch, SplatBuffers, n_tiles};
 use super::kernels::{DrawPipelines, LearnPipelines};
+use super::params::Growth;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 
 /// What the passes of one view touch.
@@ -24,6 +25,68 @@ pub(crate) struct Target<'a> {
     pub(crate) supervision: &'a Buffer,
     /// Whether D-SSIM is part of the loss.
     pub(crate) ssim: bool,
+}
+
+/// Memory of one change of the splat count.
+#[derive(Debug)]
+pub(crate) struct GrowthBuffers {
+    pub(crate) growth: Buffer,
+    pub(crate) cumulative: Buffer,
+    pub(crate) block_weights: Buffer,
+    pub(crate) n_children: Buffer,
+}
+
+/// Hands out children of the splats whose error is largest: to dead splats, and to new ones past `n_before`.
+pub(crate) fn grow(gpu: &Gpu, passes: &mut Passes, pipelines: &LearnPipelines, splats: &SplatBuffers, buffers: &GrowthBuffers, growth: &Growth) {
+    let blocks = |n: u32| u64::from(n.div_ceil(256));
+    let uniform = ("growth", &buffers.growth);
+    let weights = ("block_weights", &buffers.block_weights);
+    passes.clear(&buffers.n_children);
+    passes.dispatch(
+        gpu,
+        &pipelines.grow_weigh,
+        blocks(growth.n_before),
+        &[
+            uniform,
+            ("means", &splats.means),
+            ("shapes", &splats.shapes),
+            ("error_sums", &splats.error_sums),
+            ("cumulative", &buffers.cumulative),
+            weights,
+        ],
+    );
+    passes.dispatch(gpu, &pipelines.grow_scan, 1, &[uniform, weights]);
+    passes.dispatch(
+        gpu,
+        &pipelines.grow_child,
+        blocks(growth.n_after),
+        &[
+            uniform,
+            ("cumulative", &buffers.cumulative),
+            weights,
+            ("means", &splats.means),
+            ("rotations", &splats.rotations),
+            ("shapes", &splats.shapes),
+            ("sh_dc", &splats.sh_dc),
+            ("sh_rest", &splats.sh_rest),
+            ("moments", &splats.moments),
+            ("sh_dc_moments", &splats.sh_dc_moments),
+            ("sh_rest_moments", &splats.sh_rest_moments),
+            ("n_children", &buffers.n_children),
+        ],
+    );
+    passes.dispatch(
+        gpu,
+        &pipelines.grow_parent,
+        blocks(growth.n_after),
+        &[
+            uniform,
+            ("n_children", &buffers.n_children),
+            ("shapes", &splats.shapes),
+            ("moments", &splats.moments),
+            ("error_sums", &splats.error_sums),
+        ],
+    );
 }
 
 impl ViewPasses<'_> {

@@ -1,0 +1,18 @@
+// growth: how the splat count changes.
+
+struct Growth {
+    n_before: u32,
+    n_after: u32,
+    key: u32,             // of the random numbers
+    capacity: u32,        // stride between planes
+    n_sh_rest: u32,       // planes of sh_rest that exist
+    child_spread: f32,    // of a child's place, in standard deviations of its parent
+    child_log_scale: f32, // added to the log_scale of parent and child
+    least_opacity: f32,   // below it a splat is given a new place
+}
+
+// Whether a splat has died: hardly visible, or not a number.
+fn is_dead(mean: vec4f, shape: vec4f, least_opacity: f32) -> bool {
+    let alive = 1.0 / (1.0 + exp(-shape.w)) >= least_opacity && all(abs(mean.xyz) < vec3f(1e6)) && all(abs(shape.xyz) < vec3f(50.0));
+    return !alive;
+}

@@ -1,0 +1,226 @@
+//! Times drawing and learning on a given cloud: one picture, one step, pass by pass.
+//!
+//! The setting is that of the peer's benchmark: a pinhole camera at (0, 0, -3.2) looking along z with a focal length of
+//! 0.9 image widths, a target of uniform noise, L1 loss, every splat updated in every step.
+
+use super::arrays::SplatArrays;
+use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_tiles};
+use super::kernels::{DrawPipelines, LearnPipelines};
+use super::params::{Camera, Rule, Supervision, status};
+use super::passes::{Target, ViewPasses};
+use crate::Error;
+use crate::gpu::{Buffer, Gpu, PassTiming, Passes, f32_of};
+use kinematics::Transform;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// Learning rate of every parameter: small, so that the cloud stays the cloud.
+const RATE: f32 = 1e-5;
+
+/// Figures of one size and cloud.
+#[derive(Clone, Debug)]
+pub struct KernelFigures {
+    /// Intersections of splats and tiles.
+    pub n_isect: u64,
+    /// GPU time of a picture from the first pass to the last, milliseconds, median; wall time where there are no timestamps.
+    pub render_millis: f64,
+    /// GPU time of a step, milliseconds, median.
+    pub step_millis: f64,
+    /// Wall time of a picture, mean of a row of them back to back, milliseconds.
+    pub render_wall_millis: f64,
+    /// Wall time of a step, likewise.
+    pub step_wall_millis: f64,
+    /// Mean color of the first picture.
+    pub mean_rgb: [f64; 3],
+    /// Most bytes of GPU buffers alive at once.
+    pub peak_bytes: u64,
+    /// GPU time of each pass of one step; empty without timestamps.
+    pub passes: Vec<PassTiming>,
+}
+
+/// How often things are repeated.
+#[derive(Clone, Copy, Debug)]
+pub struct Repeats {
+    /// Before the clock starts.
+    pub n_warm_up: usize,
+    /// With timestamps.
+    pub n_timed: usize,
+    /// Back to back for the wall clock.
+    pub n_row: usize,
+}
+
+struct KernelBench {
+    gpu: Arc<Gpu>,
+    draw: DrawPipelines,
+    learn: LearnPipelines,
+    splats: SplatBuffers,
+    scratch: Scratch,
+    frame: Frame,
+    status: Buffer,
+    view: Buffer,
+    image: Buffer,
+    depth: Buffer,
+    supervision: Buffer,
+    rule: Buffer,
+    size_px: [u32; 2],
+}
+
+/// Times the kernels on `cloud` at one image size.
+pub fn time_kernels(gpu: &Arc<Gpu>, cloud: &SplatArrays, size_px: [u32; 2], repeats: Repeats) -> Result<KernelFigures, Error> {
+    let mut bench = KernelBench::new(gpu.clone(), cloud, size_px)?;
+    bench.fit()?;
+    let mut passes = Passes::default();
+    let mean_rgb = bench.mean_rgb(&mut passes)?;
+    let n_isect = u64::from(bench.counters()?[status::N_ISECT as usize]);
+    let (render_millis, render_wall_millis) = bench.time(&mut passes, repeats, KernelBench::list_picture)?;
+    let (step_millis, step_wall_millis) = bench.time(&mut passes, repeats, KernelBench::list_step)?;
+    bench.list_step(&mut passes);
+    let timings = passes.submit_timed(gpu)?;
+    Ok(KernelFigures { n_isect, render_millis, step_millis, render_wall_millis, step_wall_millis, mean_rgb, peak_bytes: gpu.peak_bytes(), passes: timings })
+}
+
+impl KernelBench {
+    fn new(gpu: Arc<Gpu>, cloud: &SplatArrays, size_px: [u32; 2]) -> Result<Self, Error> {
+        let draw = DrawPipelines::new(&gpu)?;
+        let learn = LearnPipelines::new(&gpu)?;
+        let n_splats = u32::try_from(cloud.n_splats()).map_err(|_| Error::SplatArrays("more than 2^32 splats".to_owned()))?;
+        let mut splats = SplatBuffers::new(&gpu, n_splats, cloud.sh_degree)?;
+        splats.append(&gpu, cloud);
+        let n_pixels = size_px[0] * size_px[1];
+        let focal_px = [0.9 * f64::from(size_px[0]); 2];
+        let camera = Camera {
+            world_from_camera: Transform::translation(0.0, 0.0, -3.2),
+            size_px,
+            focal_px,
+            principal_px: size_px.map(|size| f64::from(size) / 2.0),
+            shutter: None,
+            near_m: 0.01,
+            far_m: 1e6,
+            crop: None,
+        };
+        let noise: Vec<u32> = (0..n_pixels).map(|pixel| pixel.wrapping_mul(2_654_435_761).rotate_left(11).wrapping_mul(0x85eb_ca6b) | 0xff00_0000).collect();
+        let tiles = n_tiles(size_px);
+        let first_guess = ScratchSize { n_splats, n_isect: 1 << 14, n_buckets: 1 << 10, n_tiles: tiles };
+        let mut counters = [0u32; status::LEN];
+        counters[status::N_SPLATS as usize] = n_splats;
+        Ok(Self {
+            scratch: Scratch::new(&gpu, &draw, first_guess)?,
+            frame: Frame::new(&gpu, n_pixels, tiles, true)?,
+            status: gpu.storage_with("bench.status", bytemuck::cast_slice(&counters))?,
+            view: gpu.uniform_with("bench.view", &camera.view()),
+            image: gpu.storage_with("bench.target", bytemuck::cast_slice(&noise))?,
+            depth: gpu.storage("bench.depth", 4 * u64::from(n_pixels))?,
+            supervision: gpu.uniform_with("bench.supervision", &<Supervision as bytemuck::Zeroable>::zeroed()),
+            rule: gpu.uniform_with("bench.rule", &rule()),
+            draw,
+            learn,
+            splats,
+            size_px,
+            gpu,
+        })
+    }
+
+    /// Finds how large the intersection buffers must be.
+    fn fit(&mut self) -> Result<(), Error> {
+        for _ in 0..2 {
+            let mut passes = Passes::default();
+            self.view_passes().draw(&mut passes, &self.draw, &self.learn.rasterize);
+            passes.submit(&self.gpu);
+            let counters = self.counters()?;
+            let with_room = |need: u32| need + need / 16 + 64;
+            let size = ScratchSize {
+                n_splats: self.splats.n_splats,
+                n_isect: with_room(counters[status::NEED_ISECT]),
+                n_buckets: with_room(counters[status::NEED_BUCKETS].max(1)),
+                n_tiles: n_tiles(self.size_px),
+            };
+            drop(passes);
+            self.scratch = Scratch::new(&self.gpu, &self.draw, ScratchSize { n_splats: self.splats.n_splats, n_isect: 1, n_buckets: 1, n_tiles: 1 })?;
+            self.scratch = Scratch::new(&self.gpu, &self.draw, size)?;
+            self.gpu.write(&self.status, 4 * status::FAILED as u64, &[0; 12]);
+        }
+        Ok(())
+    }
+
+    fn view_passes(&self) -> ViewPasses<'_> {
+        ViewPasses {
+            gpu: &self.gpu,
+            splats: &self.splats,
+            scratch: &self.scratch,
+            frame: &self.frame,
+            status: &self.status,
+            view: &self.view,
+            size_px: self.size_px,
+        }
+    }
+
+    fn list_picture(&self, passes: &mut Passes) {
+        self.view_passes().draw(passes, &self.draw, &self.draw.rasterize);
+    }
+
+    fn list_step(&self, passes: &mut Passes) {
+        let view = self.view_passes();
+        view.draw(passes, &self.draw, &self.learn.rasterize);
+        view.compare(passes, &self.learn, &Target { image: &self.image, depth: &self.depth, supervision: &self.supervision, ssim: false });
+        view.backward(passes, &self.learn, &self.draw);
+        view.update(passes, &self.learn.update, &self.rule);
+        passes.dispatch(&self.gpu, &self.learn.advance, 1, &[("status", &self.status)]);
+    }
+
+    fn time(&self, passes: &mut Passes, repeats: Repeats, list: fn(&Self, &mut Passes)) -> Result<(f64, f64), Error> {
+        for _ in 0..repeats.n_warm_up {
+            list(self, passes);
+            passes.submit(&self.gpu);
+        }
+        self.gpu.wait()?;
+        let mut spans = Vec::new();
+        for _ in 0..repeats.n_timed {
+            list(self, passes);
+            let since = Instant::now();
+            let span = passes.submit_spanned(&self.gpu)?;
+            spans.push(span.unwrap_or_else(|| since.elapsed().as_secs_f64() * 1e3));
+        }
+        spans.sort_by(f64::total_cmp);
+        let since = Instant::now();
+        for _ in 0..repeats.n_row {
+            list(self, passes);
+            passes.submit(&self.gpu);
+        }
+        self.gpu.wait()?;
+        Ok((spans[spans.len() / 2], since.elapsed().as_secs_f64() * 1e3 / repeats.n_row as f64))
+    }
+
+    fn counters(&self) -> Result<Vec<u32>, Error> {
+        self.gpu.read(&self.status, status::LEN)
+    }
+
+    fn mean_rgb(&self, passes: &mut Passes) -> Result<[f64; 3], Error> {
+        self.list_picture(passes);
+        passes.submit(&self.gpu);
+        let n = (self.size_px[0] * self.size_px[1]) as usize;
+        let image: Vec<[f32; 4]> = self.gpu.read(&self.frame.image, n)?;
+        Ok(std::array::from_fn(|channel| image.iter().map(|pixel| f64::from(pixel[channel])).sum::<f64>() / n as f64))
+    }
+}
+
+fn rule() -> Rule {
+    Rule {
+        mean_rate_m: RATE,
+        log_scale_rate: RATE,
+        rotation_rate: RATE,
+        opacity_rate: RATE,
+        sh_dc_rate: RATE,
+        sh_rest_rate: RATE,
+        noise: 0.0,
+        final_mean_rate_frac: 1.0,
+        betas: [0.9, 0.999],
+        epsilon: f32_of(1e-15),
+        n_planned_steps: 1.0,
+        opacity_cost: 0.0,
+        scale_cost: 0.0,
+        log_scale_range: [-30.0, 30.0],
+        seed: 0,
+        update_all: 1,
+        unused: [0; 2],
+    }
+}

@@ -1,0 +1,60 @@
+//! Pictures of all directions, put together from the six faces of a cube.
+
+use super::params::Camera;
+use crate::{Error, Picture, RenderRequest};
+use kinematics::Transform;
+use nalgebra::{Rotation3, UnitQuaternion, Vector3};
+use std::f64::consts::{FRAC_PI_2, PI};
+
+/// Draws the cube's faces with `draw` and looks each direction up in them.
+///
+/// Longitude runs along x from -180 to 180 degrees, latitude along y from up to down; the camera's z axis is the middle.
+/// Depth is the distance from the camera's center, not along an axis.
+pub(crate) fn render(request: &RenderRequest, mut draw: impl FnMut(&Camera) -> Result<Picture, Error>) -> Result<Picture, Error> {
+    let [width, height] = request.size_px;
+    let edge = (width / 4).max(height / 2).max(1);
+    let face = |turn: Rotation3<f64>| Camera {
+        world_from_camera: request.world_from_camera * Transform::from_parts(nalgebra::Translation3::identity(), UnitQuaternion::from_rotation_matrix(&turn)),
+        size_px: [edge; 2],
+        focal_px: [f64::from(edge) / 2.0; 2],
+        principal_px: [f64::from(edge) / 2.0; 2],
+        shutter: None,
+        near_m: request.near_m,
+        far_m: request.far_m,
+        crop: request.crop,
+    };
+    let about = |axis, angle| Rotation3::from_axis_angle(&axis, angle);
+    let turns = [
+        Rotation3::identity(),
+        about(Vector3::y_axis(), FRAC_PI_2),
+        about(Vector3::y_axis(), PI),
+        about(Vector3::y_axis(), -FRAC_PI_2),
+        about(Vector3::x_axis(), FRAC_PI_2),
+        about(Vector3::x_axis(), -FRAC_PI_2),
+    ];
+    let faces: Vec<Picture> = turns.iter().map(|turn| draw(&face(*turn))).collect::<Result<_, _>>()?;
+    let n = (width * height) as usize;
+    let mut picture = Picture { size_px: request.size_px, rgba_srgb: Vec::with_capacity(4 * n), depth_m: Vec::with_capacity(n) };
+    for y in 0..height {
+        let latitude = FRAC_PI_2 - PI * (f64::from(y) + 0.5) / f64::from(height);
+        for x in 0..width {
+            let longitude = 2.0 * PI * (f64::from(x) + 0.5) / f64::from(width) - PI;
+            let direction = Vector3::new(latitude.cos() * longitude.sin(), -latitude.sin(), latitude.cos() * longitude.cos());
+            let (face_ix, in_face) = turns
+                .iter()
+                .map(|turn| turn.inverse() * direction)
+                .enumerate()
+                .max_by(|(_, a), (_, b)| a.z.total_cmp(&b.z))
+                .expect("a cube has six faces");
+            let pixel = |axis: usize| {
+                let along = f64::from(edge) / 2.0 * (1.0 + in_face[axis] / in_face.z);
+                (along.max(0.0) as u32).min(edge - 1)
+            };
+            let at = (pixel(1) * edge + pixel(0)) as usize;
+            let seen = &faces[face_ix];
+            picture.rgba_srgb.extend_from_slice(&seen.rgba_srgb[4 * at..4 * at + 4]);
+            picture.depth_m.push(seen.depth_m[at] / crate::gpu::f32_of(in_face.z));
+        }
+    }
+    Ok(picture)
+}

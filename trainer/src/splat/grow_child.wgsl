@@ -1,0 +1,77 @@
+// grow_child: give each dead or new splat a parent, chosen by error, and a place within it.
+//
+// threads   one per splat up to n_after
+// reads     growth, cumulative, block_weights
+// writes    means, rotations, shapes, sh_dc, sh_rest, all moments of the child; n_children [n_before] (cleared before)
+//
+// A child is never a parent: dead splats weigh nothing and new ones have no weight, so nobody reads what is written here.
+
+#import view
+#import growth
+#import random
+#import projection
+
+@group(0) @binding(0) var<uniform> growth: Growth;
+@group(0) @binding(1) var<storage, read> cumulative: array<f32>;
+@group(0) @binding(2) var<storage, read> block_weights: array<f32>;
+@group(0) @binding(3) var<storage, read_write> means: array<vec4f>;
+@group(0) @binding(4) var<storage, read_write> rotations: array<vec4f>;
+@group(0) @binding(5) var<storage, read_write> shapes: array<vec4f>;
+@group(0) @binding(6) var<storage, read_write> sh_dc: array<f32>;
+@group(0) @binding(7) var<storage, read_write> sh_rest: array<f32>;
+@group(0) @binding(8) var<storage, read_write> moments: array<vec4f>;
+@group(0) @binding(9) var<storage, read_write> sh_dc_moments: array<vec2f>;
+@group(0) @binding(10) var<storage, read_write> sh_rest_moments: array<vec2f>;
+@group(0) @binding(11) var<storage, read_write> n_children: array<atomic<u32>>;
+
+override WG_SIZE = 256u;
+@compute @workgroup_size(WG_SIZE)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let child = folded(wg, n_wgs) * WG_SIZE + lane;
+    if child >= growth.n_after { return; } // Allowed here: no barrier below.
+    if child < growth.n_before && !is_dead(means[child], shapes[child], growth.least_opacity) { return; }
+    let n_blocks = (growth.n_before + 255u) / 256u;
+    let total = block_weights[n_blocks - 1u];
+    let wanted = uniform3(vec3u(child, growth.key, 7u)).x * total;
+    // The first block, then the first splat, whose sum passes the number.
+    var low = 0u;
+    var high = n_blocks - 1u;
+    while low < high {
+        let middle = (low + high) / 2u;
+        if block_weights[middle] > wanted { high = middle; } else { low = middle + 1u; }
+    }
+    var within = wanted;
+    if low > 0u { within -= block_weights[low - 1u]; }
+    var parent = low * 256u;
+    high = min(parent + 255u, growth.n_before - 1u);
+    while parent < high {
+        let middle = (parent + high) / 2u;
+        if cumulative[middle] > within { high = middle; } else { parent = middle + 1u; }
+    }
+    let parent_is_dead = is_dead(means[parent], shapes[parent], growth.least_opacity);
+    if total <= 0.0 || parent_is_dead {
+        // Nothing to learn from yet: invisible until the next change of the count.
+        if child >= growth.n_before {
+            means[child] = vec4f(0.0);
+            rotations[child] = vec4f(1.0, 0.0, 0.0, 0.0);
+            shapes[child] = vec4f(-7.0, -7.0, -7.0, -12.0);
+        }
+        return;
+    }
+    atomicAdd(&n_children[parent], 1u); // Integer sums: the order does not matter.
+
+    let shape = shapes[parent];
+    let offset = rotation_of(rotations[parent]) * (exp(shape.xyz) * clamp(normal3(vec3u(child, growth.key, 11u)), vec3f(-2.0), vec3f(2.0)));
+    means[child] = means[parent] + vec4f(growth.child_spread * offset, 0.0);
+    rotations[child] = rotations[parent];
+    shapes[child] = shape + vec4f(vec3f(growth.child_log_scale), 0.0);
+    for (var plane = 0u; plane < 6u; plane++) { moments[plane * growth.capacity + child] = vec4f(0.0); }
+    for (var plane = 0u; plane < 3u; plane++) {
+        sh_dc[plane * growth.capacity + child] = sh_dc[plane * growth.capacity + parent];
+        sh_dc_moments[plane * growth.capacity + child] = vec2f(0.0);
+    }
+    for (var plane = 0u; plane < growth.n_sh_rest; plane++) {
+        sh_rest[plane * growth.capacity + child] = sh_rest[plane * growth.capacity + parent];
+        sh_rest_moments[plane * growth.capacity + child] = vec2f(0.0);
+    }
+}

@@ -1,0 +1,192 @@
+//! The trainer as a whole: it learns a scene, twice to the same bits, survives poison, and keeps its caps.
+
+use super::arrays::SplatArrays;
+use super::cloud::synthetic_cloud;
+use super::{SplatOptions, SplatTrainer};
+use crate::eval::{PixelPair, psnr};
+use crate::gpu::{Gpu, GpuOptions};
+use crate::{DepthMap, Keyframe, Method, Projection, RenderRequest, Split};
+use kinematics::{Stamp, Transform};
+use nalgebra::{Point3, Vector3};
+use std::sync::Arc;
+
+const SIZE_PX: [u32; 2] = [96, 80];
+const FOCAL_PX: f64 = 90.0;
+
+/// A cloud of opaque splats: something with surfaces, that depth images make sense of.
+fn scene() -> SplatArrays {
+    let mut arrays = synthetic_cloud(150, 3);
+    arrays.opacity_logits.fill(4.0);
+    arrays.log_scales.fill([-1.9; 3]);
+    arrays.sh.chunks_exact_mut(16).for_each(|coeffs| coeffs[1..].fill([0.0; 3])); // The same from every side.
+    arrays
+}
+
+fn pose(ix: usize) -> Transform {
+    let angle = ix as f64 * 0.12;
+    let eye = Point3::new(3.2 * angle.sin(), -0.4 + 0.05 * ix as f64, -3.2 * angle.cos());
+    // `face_towards` has z forward; y is turned down.
+    Transform::face_towards(&eye, &Point3::origin(), &Vector3::new(0.0, -1.0, 0.0)) * nalgebra::UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::PI)
+}
+
+fn request(world_from_camera: Transform) -> RenderRequest {
+    RenderRequest {
+        world_from_camera,
+        size_px: SIZE_PX,
+        projection: Projection::Pinhole { focal_px: [FOCAL_PX; 2], principal_px: [48.0, 40.0] },
+        shutter: None,
+        near_m: 0.01,
+        far_m: 100.0,
+        crop: None,
+        background_srgb: [0.0; 3],
+    }
+}
+
+fn keyframes(gpu: &Arc<Gpu>, with_depth: bool) -> Vec<Arc<Keyframe>> {
+    let mut truth = SplatTrainer::from_arrays(gpu.clone(), SplatOptions::default(), &scene()).unwrap();
+    (0..10)
+        .map(|ix| {
+            let world_from_camera = pose(ix);
+            let picture = truth.render(&request(world_from_camera)).unwrap();
+            let mut rgba = picture.rgba_srgb;
+            rgba.chunks_exact_mut(4).for_each(|pixel| pixel[3] = 255);
+            let (focal_px, principal_px) = ([FOCAL_PX; 2], [48.0, 40.0]);
+            let depth = DepthMap { size_px: SIZE_PX, focal_px, principal_px, depth_m: picture.depth_m.into(), world_from_camera };
+            Arc::new(Keyframe {
+                camera: "test".into(),
+                stamp: Stamp(ix as i64),
+                size_px: SIZE_PX,
+                focal_px,
+                principal_px,
+                rgba_srgb: rgba.into(),
+                depth: with_depth.then_some(depth),
+                world_from_camera,
+                twist: None,
+                readout_secs: 0.0,
+                split: Split::of(ix),
+                truth: None,
+            })
+        })
+        .collect()
+}
+
+fn options() -> SplatOptions {
+    SplatOptions { max_splats: 1500, n_planned_steps: 300, coarse_steps: [20, 60], sh_degree: 1, ..SplatOptions::default() }
+}
+
+fn train(trainer: &mut SplatTrainer, n_steps: u64) {
+    let end = trainer.progress().step + n_steps;
+    while trainer.progress().step < end {
+        trainer.step(end - trainer.progress().step).unwrap();
+    }
+}
+
+fn test_psnr(trainer: &mut SplatTrainer, keyframes: &[Arc<Keyframe>]) -> f64 {
+    let tests: Vec<f64> = keyframes
+        .iter()
+        .filter(|keyframe| keyframe.split == Split::Test)
+        .map(|keyframe| {
+            let picture = trainer.render(&request(keyframe.world_from_camera)).unwrap();
+            psnr(&PixelPair::new(SIZE_PX, &picture.rgba_srgb, &keyframe.rgba_srgb).unwrap()).unwrap()
+        })
+        .collect();
+    tests.iter().sum::<f64>() / tests.len() as f64
+}
+
+#[test]
+fn learns_unseen_views_and_gives_the_same_bits_twice() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = keyframes(&gpu, true);
+    let run = |seed| {
+        let mut trainer = SplatTrainer::new(gpu.clone(), SplatOptions { seed, ..options() }).unwrap();
+        for keyframe in &keyframes {
+            trainer.push(keyframe.clone()).unwrap();
+        }
+        let before = test_psnr(&mut trainer, &keyframes);
+        train(&mut trainer, 220);
+        (before, test_psnr(&mut trainer, &keyframes), trainer.arrays().unwrap())
+    };
+    let (before, after, arrays) = run(1);
+    println!("PSNR {before:.2} -> {after:.2} dB with {} splats", arrays.n_splats());
+    assert!(after > before + 3.0 && after > 24.0, "{before} -> {after} dB");
+    assert!(arrays.clone().checked().is_ok(), "a parameter is not finite");
+    assert!(run(1).2 == arrays, "the same seed gave other bits");
+    assert!(run(2).2 != arrays, "the seed has no effect: the comparison cannot fail");
+}
+
+#[test]
+fn learns_without_depth_from_a_random_start() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = keyframes(&gpu, false);
+    let mut trainer = SplatTrainer::new(gpu, options()).unwrap();
+    for keyframe in &keyframes {
+        trainer.push(keyframe.clone()).unwrap();
+    }
+    train(&mut trainer, 10);
+    let before = test_psnr(&mut trainer, &keyframes);
+    train(&mut trainer, 120);
+    let after = test_psnr(&mut trainer, &keyframes);
+    assert!(after > before + 2.0, "{before} -> {after} dB");
+}
+
+#[test]
+fn a_cap_in_bytes_holds() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = keyframes(&gpu, true);
+    let base = options();
+    let cap_bytes = 500 * base.bytes_per_splat();
+    let mut trainer = SplatTrainer::new(gpu, SplatOptions { max_bytes: Some(cap_bytes), ..base }).unwrap();
+    for keyframe in &keyframes {
+        trainer.push(keyframe.clone()).unwrap();
+    }
+    train(&mut trainer, 210);
+    let progress = trainer.progress();
+    assert!(progress.primitives > 0 && progress.bytes <= cap_bytes, "{progress:?} against {cap_bytes}");
+}
+
+#[test]
+fn scratch_memory_grows_when_a_view_needs_more() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let mut arrays = scene();
+    arrays.log_scales.iter_mut().for_each(|scale| *scale = [0.5; 3]); // Every splat covers every tile.
+    arrays.opacity_logits.iter_mut().for_each(|opacity| *opacity = -3.0);
+    let keyframes = keyframes(&gpu, true);
+    let mut trainer = SplatTrainer::from_arrays(gpu, SplatOptions { coarse_steps: [0, 0], ..options() }, &arrays).unwrap();
+    for keyframe in &keyframes[1..4] {
+        trainer.push(Arc::new(Keyframe { depth: None, ..keyframe.as_ref().clone() })).unwrap();
+    }
+    train(&mut trainer, 12);
+    let picture = trainer.render(&RenderRequest { size_px: [640, 480], ..request(pose(0)) }).unwrap();
+    assert!(picture.rgba_srgb.iter().any(|byte| *byte > 0));
+    assert_eq!(trainer.progress().step, 12);
+}
+
+#[test]
+fn all_directions_agree_with_the_pinhole_view() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let mut trainer = SplatTrainer::from_arrays(gpu, SplatOptions::default(), &scene()).unwrap();
+    let around = trainer.render(&RenderRequest { size_px: [512, 256], projection: Projection::Equirectangular, ..request(pose(2)) }).unwrap();
+    let ahead = trainer.render(&request(pose(2))).unwrap();
+    let middle = |picture: &crate::Picture| {
+        let at = ((picture.size_px[1] / 2) * picture.size_px[0] + picture.size_px[0] / 2) as usize;
+        (picture.rgba_srgb[4 * at], picture.depth_m[at])
+    };
+    let ((gray_around, depth_around), (gray_ahead, depth_ahead)) = (middle(&around), middle(&ahead));
+    assert!(gray_around.abs_diff(gray_ahead) < 40 && (depth_around - depth_ahead).abs() < 0.1, "{:?} {:?}", middle(&around), middle(&ahead));
+}
+
+#[test]
+fn a_keyframe_full_of_nan_costs_no_parameter() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let mut frames = keyframes(&gpu, true);
+    let spoiled = frames[1].as_ref().clone();
+    let mut depth = spoiled.depth.clone().unwrap();
+    depth.depth_m = depth.depth_m.iter().enumerate().map(|(ix, z)| if ix % 2 == 0 { f32::NAN } else { f32::INFINITY.min(*z) }).collect();
+    frames.push(Arc::new(Keyframe { depth: Some(depth), stamp: Stamp(99), ..spoiled }));
+    let mut trainer = SplatTrainer::new(gpu, options()).unwrap();
+    for keyframe in &frames {
+        trainer.push(keyframe.clone()).unwrap();
+    }
+    train(&mut trainer, 60);
+    assert!(trainer.arrays().unwrap().checked().is_ok());
+}

@@ -1,0 +1,60 @@
+//! How a splat model learns.
+
+/// Settings of a [`super::SplatTrainer`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct SplatOptions {
+    /// Seeds every random choice.
+    pub seed: u64,
+    /// Most splats the model may have.
+    pub max_splats: u32,
+    /// Most bytes of GPU memory the model (parameters and the optimiser's moments) may take.
+    pub max_bytes: Option<u64>,
+    /// Highest degree of spherical harmonics, 0 to 3.
+    pub sh_degree: u32,
+    /// Steps over which learning rates fall and the model grows.
+    pub n_planned_steps: u64,
+    /// Share of D-SSIM in the color loss.
+    pub dssim_frac: f64,
+    /// Weight of the depth loss, per metre.
+    pub depth_per_m: f64,
+    /// Steps at a quarter of the resolution, and past which step the full one is used.
+    pub coarse_steps: [u64; 2],
+}
+
+impl Default for SplatOptions {
+    fn default() -> Self {
+        Self {
+            seed: 0,
+            max_splats: 200_000,
+            max_bytes: None,
+            sh_degree: 3,
+            n_planned_steps: 7000,
+            dssim_frac: 0.2,
+            depth_per_m: 0.1,
+            coarse_steps: [150, 400],
+        }
+    }
+}
+
+impl SplatOptions {
+    /// Bytes of one splat: parameters and Adam's two moments.
+    pub fn bytes_per_splat(&self) -> u64 {
+        let n_floats = 12 + 3 + u64::from(super::buffers::n_sh_rest(self.sh_degree)); // Means, rotations and shapes are padded to 4 each.
+        4 * (3 * n_floats + 1)
+    }
+
+    /// Most splats that both caps allow.
+    pub(crate) fn cap(&self) -> u32 {
+        let by_bytes = self.max_bytes.map_or(u64::MAX, |bytes| bytes / self.bytes_per_splat());
+        self.max_splats.min(u32::try_from(by_bytes).unwrap_or(u32::MAX)).max(1)
+    }
+
+    /// How many times smaller than full size, as a power of two, images are at a step.
+    pub(crate) fn level_at(&self, step: u64) -> u32 {
+        match step {
+            step if step < self.coarse_steps[0] => 2,
+            step if step < self.coarse_steps[1] => 1,
+            _ => 0,
+        }
+    }
+}

@@ -1,0 +1,180 @@
+//! First splats: flat discs on what depth shows, or a cloud in the cameras' common view.
+
+use super::arrays::SplatArrays;
+use crate::gpu::{f32_of, f32s_of};
+use crate::{DepthMap, Keyframe};
+use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
+use std::collections::HashSet;
+
+/// Discs one image may add.
+const SEEDS_PER_IMAGE: f64 = 20_000.0;
+/// Neighbours whose depths differ by more than this share lie on different surfaces.
+const EDGE_FRAC: f64 = 0.04;
+/// Standard deviation of a disc in spacings of the grid: neighbours overlap without blurring.
+const SPREAD: f64 = 0.6;
+/// Thickness of a disc in spacings.
+const THICKNESS: f64 = 0.15;
+const SEED_OPACITY: f64 = 0.7;
+/// Splats of a start without depth.
+const N_RANDOM: usize = 50_000;
+const RANDOM_OPACITY: f64 = 0.1;
+const SH_0: f64 = 0.282_094_791_773_878_14;
+
+/// Remembers which places have been given splats.
+#[derive(Debug, Default)]
+pub(crate) struct Seeder {
+    /// Octave of the spacing, and the cell of that size.
+    taken: HashSet<(i32, [i32; 3])>,
+}
+
+impl Seeder {
+    /// Discs for what this keyframe sees and nobody has seen at this fineness.
+    pub(crate) fn discs(&mut self, keyframe: &Keyframe, depth: &DepthMap, sh_degree: u32) -> SplatArrays {
+        let mut seeds = Seeds::new(sh_degree);
+        let [width, height] = depth.size_px;
+        let stride = ((f64::from(width) * f64::from(height) / SEEDS_PER_IMAGE).sqrt().round() as u32).max(1);
+        let at = |x: u32, y: u32| f64::from(depth.depth_m[(y * width + x) as usize]);
+        for y in (stride / 2..height).step_by(stride as usize) {
+            for x in (stride / 2..width).step_by(stride as usize) {
+                let z = at(x, y);
+                if !(z > 0.0 && z.is_finite()) || x < stride || y < stride || x + stride >= width || y + stride >= height {
+                    continue;
+                }
+                let around = [at(x - stride, y), at(x + stride, y), at(x, y - stride), at(x, y + stride)];
+                if around.iter().any(|near| (near - z).abs() > EDGE_FRAC * z && *near > 0.0) {
+                    continue;
+                }
+                let point_in_camera = |x: u32, y: u32, z: f64| unproject(depth, x, y, z);
+                let here = point_in_camera(x, y, z);
+                let spacing_m = f64::from(stride) * z / depth.focal_px[0];
+                let place = depth.world_from_camera * Point3::from(here);
+                let Some(color) = color_at(keyframe, &place) else { continue };
+                if !self.take(&place, spacing_m) {
+                    continue;
+                }
+                let filled = |near: f64| if near > 0.0 { near } else { z };
+                let across = point_in_camera(x + stride, y, filled(around[1])) - point_in_camera(x - stride, y, filled(around[0]));
+                let down = point_in_camera(x, y + stride, filled(around[3])) - point_in_camera(x, y - stride, filled(around[2]));
+                let normal = across.cross(&down).try_normalize(1e-12).unwrap_or_else(Vector3::z);
+                let normal_in_world = depth.world_from_camera * normal;
+                // Seen at a slant the grid is wider apart on the surface.
+                let slant = (normal.dot(&here.normalize()).abs()).max(0.3);
+                let size = [SPREAD * spacing_m / slant.sqrt(), SPREAD * spacing_m / slant.sqrt(), THICKNESS * spacing_m];
+                seeds.push(&place, &normal_in_world, size, SEED_OPACITY, color);
+            }
+        }
+        seeds.arrays
+    }
+
+    fn take(&mut self, place: &Point3<f64>, spacing_m: f64) -> bool {
+        let octave = spacing_m.log2().round() as i32;
+        let key = |octave: i32| (octave, std::array::from_fn(|axis| (place[axis] / 2f64.powi(octave)).floor() as i32));
+        if [octave - 1, octave, octave + 1].iter().any(|octave| self.taken.contains(&key(*octave))) {
+            return false;
+        }
+        self.taken.insert(key(octave))
+    }
+}
+
+/// A cloud along the rays of all keyframes, densest around the point that the cameras look at together.
+pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize, sh_degree: u32) -> SplatArrays {
+    let mut seeds = Seeds::new(sh_degree);
+    let focus = common_focus(keyframes);
+    let mut random = Random(seed ^ 0x5eed_5eed);
+    let n = N_RANDOM.min(n_max);
+    for _ in 0..n {
+        let keyframe = keyframes[((random.next() * keyframes.len() as f64) as usize).min(keyframes.len() - 1)];
+        let [width, height] = keyframe.size_px;
+        let x = ((random.next() * f64::from(width)) as u32).min(width - 1);
+        let y = ((random.next() * f64::from(height)) as u32).min(height - 1);
+        let camera = keyframe.world_from_camera.translation.vector;
+        let distance_m = (focus - camera).norm().max(1e-3);
+        // From a third of the way to three times as far, evenly in inverse depth beyond the focus.
+        let share = random.next();
+        let z = distance_m * if share < 0.5 { 0.35 + 1.3 * share } else { 1.0 / (1.0 - 0.66 * (2.0 * share - 1.0)) };
+        let ray = Vector3::new(
+            (f64::from(x) + 0.5 - keyframe.principal_px[0]) / keyframe.focal_px[0],
+            (f64::from(y) + 0.5 - keyframe.principal_px[1]) / keyframe.focal_px[1],
+            1.0,
+        );
+        let pixel = ((y * width + x) * 4) as usize;
+        let rgb = &keyframe.rgba_srgb[pixel..pixel + 4];
+        if rgb[3] == 0 {
+            continue;
+        }
+        let place = keyframe.world_from_camera * Point3::from(ray * z);
+        let spacing_px = (f64::from(width) * f64::from(height) * keyframes.len() as f64 / n as f64).sqrt();
+        let size = 0.3 * spacing_px * z / keyframe.focal_px[0];
+        let color = [0, 1, 2].map(|channel| f64::from(rgb[channel]) / 255.0);
+        seeds.push(&place, &Vector3::z(), [size; 3], RANDOM_OPACITY, color);
+    }
+    seeds.arrays
+}
+
+/// The point nearest to all optical axes in the sense of least squares, kept in front of the cameras.
+pub(crate) fn common_focus(keyframes: &[&Keyframe]) -> Vector3<f64> {
+    let mut normal_matrix = Matrix3::identity() * 1e-6;
+    let mut right = Vector3::zeros();
+    for keyframe in keyframes {
+        let axis = keyframe.world_from_camera * Vector3::z();
+        let camera = keyframe.world_from_camera.translation.vector;
+        let across = Matrix3::identity() - axis * axis.transpose();
+        normal_matrix += across;
+        right += across * camera;
+    }
+    normal_matrix.lu().solve(&right).unwrap_or_else(Vector3::zeros)
+}
+
+/// Color of the keyframe where it sees `place`; `None` outside and where it is masked.
+fn color_at(keyframe: &Keyframe, place: &Point3<f64>) -> Option<[f64; 3]> {
+    let point = keyframe.world_from_camera.inverse() * place;
+    if point.z <= 0.0 {
+        return None;
+    }
+    let pixel = [0, 1].map(|axis| (keyframe.focal_px[axis] * point[axis] / point.z + keyframe.principal_px[axis]).floor());
+    let inside = (0..2).all(|axis| pixel[axis] >= 0.0 && pixel[axis] < f64::from(keyframe.size_px[axis]));
+    let at = inside.then(|| 4 * (pixel[1] as usize * keyframe.size_px[0] as usize + pixel[0] as usize))?;
+    let rgba = &keyframe.rgba_srgb[at..at + 4];
+    (rgba[3] > 0).then(|| [0, 1, 2].map(|channel| f64::from(rgba[channel]) / 255.0))
+}
+
+fn unproject(depth: &DepthMap, x: u32, y: u32, z: f64) -> Vector3<f64> {
+    let ray = |pixel: u32, axis: usize| (f64::from(pixel) + 0.5 - depth.principal_px[axis]) / depth.focal_px[axis];
+    Vector3::new(ray(x, 0), ray(y, 1), 1.0) * z
+}
+
+struct Seeds {
+    arrays: SplatArrays,
+    n_rest: usize,
+}
+
+impl Seeds {
+    fn new(sh_degree: u32) -> Self {
+        Self { arrays: SplatArrays { sh_degree, ..SplatArrays::default() }, n_rest: ((sh_degree + 1) * (sh_degree + 1) - 1) as usize }
+    }
+
+    fn push(&mut self, place: &Point3<f64>, normal: &Vector3<f64>, size_m: [f64; 3], opacity: f64, color: [f64; 3]) {
+        let turn = Rotation3::rotation_between(&Vector3::z(), normal).unwrap_or_else(|| Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI));
+        let rotation = UnitQuaternion::from_rotation_matrix(&turn);
+        let arrays = &mut self.arrays;
+        arrays.means.push(f32s_of(place.coords.into()));
+        arrays.log_scales.push(f32s_of(size_m.map(|size| size.max(1e-7).ln())));
+        arrays.rotations_wxyz.push(f32s_of([rotation.w, rotation.i, rotation.j, rotation.k]));
+        arrays.opacity_logits.push(f32_of((opacity / (1.0 - opacity)).ln()));
+        arrays.sh.push(f32s_of(color.map(|value| (value - 0.5) / SH_0)));
+        arrays.sh.extend(std::iter::repeat_n([0.0; 3], self.n_rest));
+    }
+}
+
+/// Splitmix64 (Steele et al. 2014): numbers of 0 <= x < 1.
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
+    }
+}

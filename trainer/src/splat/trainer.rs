@@ -1,0 +1,529 @@
+//! The splat model as a [`Method`]: seeds, steps, growth, pictures.
+
+use super::arrays::SplatArrays;
+use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_sh_rest, n_tiles};
+use super::kernels::{DrawPipelines, LearnPipelines};
+use super::options::SplatOptions;
+use super::params::{Camera, Growth, Rule, Supervision, status};
+use super::passes::{self, GrowthBuffers, Target, ViewPasses};
+use super::seed::{self, Seeder};
+use super::views::TrainView;
+use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
+use crate::{Error, Keyframe, Method, Picture, Progress, Projection, RenderRequest, Split, ply};
+use kinematics::Stamp;
+use std::path::Path;
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::Instant;
+
+/// Steps between changes of the splat count, and before the first.
+const GROWTH_PERIOD: u64 = 100;
+const GROWTH_START: u64 = 200;
+/// Share of the planned steps after which the count stays.
+const GROWTH_END_FRAC: f64 = 0.75;
+/// Growth at each change.
+const GROWTH_FRAC: f64 = 0.1;
+/// Steps between degrees of spherical harmonics.
+const SH_PERIOD: u64 = 300;
+/// GPU time a submit may hold, so that pictures and Ctrl-C get their turn.
+const SUBMIT_MILLIS: f64 = 20.0;
+/// Most steps of a submit.
+const MAX_STEPS_PER_SUBMIT: u64 = 64;
+/// Readings further than this from the rendered depth are outliers.
+const DEPTH_CLIP_M: f64 = 0.2;
+
+/// 3D Gaussian splats that learn from keyframes.
+#[derive(Debug)]
+pub struct SplatTrainer {
+    gpu: Arc<Gpu>,
+    options: SplatOptions,
+    draw: DrawPipelines,
+    learn: Learn,
+    splats: SplatBuffers,
+    scratch: Option<(ScratchSize, Scratch)>,
+    learn_frame: Option<Frame>,
+    draw_frame: Option<Frame>,
+    learn_status: Buffer,
+    draw_status: Buffer,
+    rule: Buffer,
+    supervision: Buffer,
+    plain: Buffer,
+    passes: Passes,
+    seeder: Seeder,
+    seeded: usize,
+    views: Vec<TrainView>,
+    scene_size_m: f64,
+    step: u64,
+    grown_at: u64,
+    n_poisoned: u64,
+    in_flight: Option<InFlight>,
+    step_millis: f64,
+}
+
+#[derive(Debug)]
+enum Learn {
+    Compiling(JoinHandle<Result<LearnPipelines, Error>>),
+    Ready(Arc<LearnPipelines>),
+    Failed,
+}
+
+#[derive(Debug)]
+struct InFlight {
+    status: PendingRead,
+    n_steps: u64,
+    since: Instant,
+}
+
+impl SplatTrainer {
+    /// An empty model. Drawing works at once; what learning needs is compiled on another thread.
+    pub fn new(gpu: Arc<Gpu>, options: SplatOptions) -> Result<Self, Error> {
+        let draw = DrawPipelines::new(&gpu)?;
+        let for_learning = gpu.clone();
+        let learn = Learn::Compiling(std::thread::spawn(move || LearnPipelines::new(&for_learning)));
+        let zeros = [0u8; 4 * status::LEN];
+        Ok(Self {
+            draw,
+            learn,
+            splats: SplatBuffers::new(&gpu, 1, options.sh_degree)?,
+            scratch: None,
+            learn_frame: None,
+            draw_frame: None,
+            learn_status: gpu.storage_with("splat.learn_status", &zeros)?,
+            draw_status: gpu.storage_with("splat.draw_status", &zeros)?,
+            rule: gpu.uniform_with("splat.rule", &<Rule as bytemuck::Zeroable>::zeroed()),
+            supervision: gpu.uniform_with(
+                "splat.supervision",
+                &Supervision {
+                    background_srgb: [0.0; 3],
+                    dssim_frac: f32_of(options.dssim_frac),
+                    depth_weight: f32_of(options.depth_per_m),
+                    depth_clip_m: f32_of(DEPTH_CLIP_M),
+                    unused: [0.0; 2],
+                },
+            ),
+            plain: gpu.uniform_with("splat.background", &<Supervision as bytemuck::Zeroable>::zeroed()),
+            passes: Passes::default(),
+            seeder: Seeder::default(),
+            seeded: 0,
+            views: Vec::new(),
+            scene_size_m: 1.0,
+            step: 0,
+            grown_at: 0,
+            n_poisoned: 0,
+            in_flight: None,
+            step_millis: 0.0,
+            gpu,
+            options,
+        })
+    }
+
+    /// A model of given splats, to be drawn or trained on.
+    pub fn from_arrays(gpu: Arc<Gpu>, options: SplatOptions, arrays: &SplatArrays) -> Result<Self, Error> {
+        let options = SplatOptions { sh_degree: arrays.sh_degree, ..options };
+        let mut trainer = Self::new(gpu, options)?;
+        trainer.add(arrays)?;
+        Ok(trainer)
+    }
+
+    /// Reads what [`Method::save`] wrote.
+    pub fn load(gpu: Arc<Gpu>, folder: &Path) -> Result<Self, Error> {
+        let arrays = ply::read(&folder.join("splats.ply"))?;
+        Self::from_arrays(gpu, SplatOptions::default(), &arrays)
+    }
+
+    /// The splats as they are now.
+    pub fn arrays(&mut self) -> Result<SplatArrays, Error> {
+        self.settle()?;
+        self.splats.read(&self.gpu)
+    }
+
+    /// Gradients that were not finite and were dropped.
+    pub fn n_poisoned(&self) -> u64 {
+        self.n_poisoned
+    }
+
+    /// One step on the first view with a timestamp around every pass; empty without timestamps.
+    pub fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
+        self.settle()?;
+        self.begin_learning()?;
+        let learn = self.learn()?;
+        self.write_rule();
+        self.record_step(&learn, self.step)?;
+        let timings = self.passes.submit_timed(&self.gpu)?;
+        self.step += 1;
+        Ok(timings)
+    }
+
+    fn learn(&mut self) -> Result<Arc<LearnPipelines>, Error> {
+        if let Learn::Ready(ready) = &self.learn {
+            return Ok(ready.clone());
+        }
+        match std::mem::replace(&mut self.learn, Learn::Failed) {
+            Learn::Compiling(thread) => {
+                let ready = Arc::new(thread.join().map_err(|_| Error::DeviceLost)??);
+                self.learn = Learn::Ready(ready.clone());
+                Ok(ready)
+            }
+            _ => Err(Error::DeviceLost),
+        }
+    }
+
+    /// Adds splats, up to the cap.
+    fn add(&mut self, arrays: &SplatArrays) -> Result<(), Error> {
+        let n_new = arrays.n_splats().min((self.options.cap() - self.splats.n_splats.min(self.options.cap())) as usize);
+        if n_new == 0 {
+            return Ok(());
+        }
+        let n_after = self.splats.n_splats + u32::try_from(n_new).expect("the cap is a u32");
+        self.make_room(n_after)?;
+        let kept = if n_new == arrays.n_splats() { arrays.clone() } else { spread_out(arrays, n_new) };
+        self.splats.append(&self.gpu, &kept);
+        self.tell_n();
+        Ok(())
+    }
+
+    fn make_room(&mut self, n_splats: u32) -> Result<(), Error> {
+        if n_splats > self.splats.capacity {
+            let capacity = n_splats.max(self.splats.capacity.saturating_mul(3) / 2).min(self.options.cap().max(n_splats));
+            self.splats = self.splats.grown(&self.gpu, capacity)?;
+            self.passes.forget_bindings();
+        }
+        Ok(())
+    }
+
+    fn tell_n(&self) {
+        for status in [&self.learn_status, &self.draw_status] {
+            self.gpu.write(status, 4 * u64::from(status::N_SPLATS), bytemuck::bytes_of(&self.splats.n_splats));
+        }
+    }
+
+    /// Seeds from keyframes with depth as they come; a cloud when there is none by the first step.
+    fn seed_from(&mut self, keyframe: &Keyframe) -> Result<(), Error> {
+        let Some(depth) = &keyframe.depth else { return Ok(()) };
+        let discs = self.seeder.discs(keyframe, depth, self.options.sh_degree);
+        self.seeded += discs.n_splats();
+        self.add(&discs)
+    }
+
+    fn begin_learning(&mut self) -> Result<(), Error> {
+        if self.splats.n_splats == 0 && !self.views.is_empty() {
+            let keyframes: Vec<&Keyframe> = self.views.iter().map(|view| view.keyframe.as_ref()).collect();
+            let cloud = seed::random_cloud(&keyframes, self.options.seed, self.options.cap() as usize, self.options.sh_degree);
+            self.add(&cloud)?;
+        }
+        Ok(())
+    }
+
+    /// How large the scene is for the learning rate of the means: the spread of the cameras, or how far they look.
+    fn measure_scene(&mut self) {
+        let keyframes: Vec<&Keyframe> = self.views.iter().map(|view| view.keyframe.as_ref()).collect();
+        let centers: Vec<_> = keyframes.iter().map(|keyframe| keyframe.world_from_camera.translation.vector).collect();
+        let middle = centers.iter().sum::<nalgebra::Vector3<f64>>() / centers.len().max(1) as f64;
+        let spread = centers.iter().map(|center| (center - middle).norm()).fold(0.0, f64::max);
+        let mut depths: Vec<f64> = keyframes.iter().filter_map(|keyframe| median_depth_m(keyframe)).collect();
+        depths.sort_by(f64::total_cmp);
+        let looks = depths.get(depths.len() / 2).copied().unwrap_or(spread);
+        self.scene_size_m = (1.1 * spread).max(0.5 * looks).max(1e-3);
+    }
+
+    fn write_rule(&self) {
+        let size = f32_of(self.scene_size_m);
+        let rule = Rule {
+            mean_rate_m: 1.6e-4 * size,
+            log_scale_rate: 5e-3,
+            rotation_rate: 1e-3,
+            opacity_rate: 5e-2,
+            sh_dc_rate: 2.5e-3,
+            sh_rest_rate: 2.5e-3 / 20.0,
+            noise: 5e5,
+            final_mean_rate_frac: 0.01,
+            betas: [0.9, 0.999],
+            epsilon: 1e-15,
+            n_planned_steps: f32_of(self.options.n_planned_steps as f64),
+            opacity_cost: 0.01 / self.splats.n_splats.max(1) as f32,
+            scale_cost: 0.01 / self.splats.n_splats.max(1) as f32,
+            log_scale_range: [(1e-5 * size).ln(), (2.0 * size).ln()],
+            seed: (self.options.seed ^ (self.options.seed >> 32)) as u32,
+            update_all: 0,
+            unused: [0; 2],
+        };
+        self.gpu.write(&self.rule, 0, bytemuck::bytes_of(&rule));
+    }
+
+    /// Lists the passes of one step.
+    fn record_step(&mut self, learn: &LearnPipelines, step: u64) -> Result<(), Error> {
+        let view_ix = pick(step, self.views.len(), self.options.seed);
+        let level_ix = self.options.level_at(step);
+        let size_px = self.views[view_ix].level(&self.gpu, level_ix)?.size_px;
+        let need = self.scratch_need(size_px, true);
+        self.ensure_scratch(need)?;
+        ensure_frame(&self.gpu, &mut self.learn_frame, &mut self.passes, size_px, true)?;
+        let level = self.views[view_ix].level(&self.gpu, level_ix)?;
+        let (Some((_, scratch)), Some(frame)) = (&self.scratch, &self.learn_frame) else { return Err(Error::DeviceLost) };
+        let view = ViewPasses { gpu: &self.gpu, splats: &self.splats, scratch, frame, status: &self.learn_status, view: &level.view, size_px };
+        let target = Target { image: &level.image, depth: &level.depth, supervision: &self.supervision, ssim: self.options.dssim_frac > 0.0 };
+        view.draw(&mut self.passes, &self.draw, &learn.rasterize);
+        view.compare(&mut self.passes, learn, &target);
+        view.backward(&mut self.passes, learn, &self.draw);
+        view.update(&mut self.passes, &learn.update, &self.rule);
+        self.passes.dispatch(&self.gpu, &learn.advance, 1, &[("status", &self.learn_status)]);
+        Ok(())
+    }
+
+    fn scratch_need(&self, size_px: [u32; 2], learn: bool) -> ScratchSize {
+        let n_splats = self.splats.capacity;
+        let tiles = n_tiles(size_px);
+        let n_isect = (4 * n_splats).max(1 << 14);
+        ScratchSize { n_splats, n_isect, n_buckets: if learn { n_isect / 24 + tiles } else { 0 }, n_tiles: tiles }
+    }
+
+    fn ensure_scratch(&mut self, need: ScratchSize) -> Result<(), Error> {
+        let have = self.scratch.as_ref().map(|(size, _)| *size);
+        let fits = have.is_some_and(|have| {
+            have.n_splats >= need.n_splats && have.n_isect >= need.n_isect && have.n_buckets >= need.n_buckets && have.n_tiles >= need.n_tiles
+        });
+        if fits {
+            return Ok(());
+        }
+        let have = have.unwrap_or(need);
+        let size = ScratchSize {
+            n_splats: need.n_splats.max(have.n_splats),
+            n_isect: need.n_isect.max(have.n_isect),
+            n_buckets: need.n_buckets.max(have.n_buckets),
+            n_tiles: need.n_tiles.max(have.n_tiles),
+        };
+        self.passes.submit(&self.gpu); // What is listed holds the old buffers.
+        self.passes.forget_bindings();
+        self.scratch = None;
+        self.scratch = Some((size, Scratch::new(&self.gpu, &self.draw, size)?));
+        Ok(())
+    }
+
+    /// Gives a failed submit larger buffers; true when there was a failure.
+    fn mend(&mut self, counters: &[u32]) -> Result<bool, Error> {
+        if counters[status::FAILED] == 0 {
+            return Ok(false);
+        }
+        let Some((size, _)) = self.scratch else { return Ok(false) };
+        let larger = |need: u32, have: u32| if need > have { need.saturating_add(need / 2) } else { have };
+        let need = ScratchSize {
+            n_isect: larger(counters[status::NEED_ISECT], size.n_isect),
+            n_buckets: larger(counters[status::NEED_BUCKETS], size.n_buckets),
+            ..size
+        };
+        log::debug!("splat: intersections need {need:?}");
+        self.ensure_scratch(need)?;
+        Ok(true)
+    }
+
+    /// Waits for the submit in flight and takes note of what it did.
+    fn settle(&mut self) -> Result<(), Error> {
+        let Some(in_flight) = self.in_flight.take() else { return Ok(()) };
+        let counters: Vec<u32> = in_flight.status.finish(&self.gpu)?;
+        let millis = in_flight.since.elapsed().as_secs_f64() * 1e3 / in_flight.n_steps.max(1) as f64;
+        self.step_millis = if self.step_millis == 0.0 { millis } else { 0.8 * self.step_millis + 0.2 * millis };
+        self.n_poisoned = u64::from(counters[status::N_POISONED]);
+        if self.mend(&counters)? {
+            self.step = u64::from(counters[status::STEP]);
+            self.gpu.write(&self.learn_status, 4 * status::FAILED as u64, &[0; 12]);
+        }
+        Ok(())
+    }
+
+    /// Changes the splat count when it is due: dead splats get new places, and there are more of them up to the cap.
+    fn grow_when_due(&mut self, learn: &LearnPipelines) -> Result<(), Error> {
+        let last = (GROWTH_END_FRAC * self.options.n_planned_steps as f64) as u64;
+        let due = self.step >= GROWTH_START && self.step < last && self.step % GROWTH_PERIOD == 0 && self.grown_at != self.step;
+        if !due {
+            return Ok(());
+        }
+        self.settle()?;
+        if self.step % GROWTH_PERIOD != 0 {
+            return Ok(()); // The submit had failed; the change is due again when its steps are done.
+        }
+        self.grown_at = self.step;
+        let n_before = self.splats.n_splats;
+        let wanted = n_before + (f64::from(n_before) * GROWTH_FRAC).ceil() as u32;
+        let n_after = wanted.min(self.options.cap()).max(n_before);
+        self.make_room(n_after)?;
+        let growth = Growth {
+            n_before,
+            n_after,
+            key: (self.step as u32).wrapping_mul(0x9e37_79b9) ^ self.options.seed as u32,
+            capacity: self.splats.capacity,
+            n_sh_rest: n_sh_rest(self.splats.sh_degree),
+            child_spread: 0.8,
+            child_log_scale: -0.35,
+            least_opacity: 0.005,
+        };
+        let words = |name: &str, n: u32| self.gpu.storage(name, 4 * u64::from(n));
+        let buffers = GrowthBuffers {
+            growth: self.gpu.uniform_with("splat.growth", &growth),
+            cumulative: words("splat.cumulative", n_before)?,
+            block_weights: words("splat.block_weights", n_before.div_ceil(256))?,
+            n_children: words("splat.n_children", n_before)?,
+        };
+        passes::grow(&self.gpu, &mut self.passes, learn, &self.splats, &buffers, &growth);
+        self.passes.submit(&self.gpu);
+        self.passes.forget_bindings();
+        self.splats.set_n(&self.gpu, n_after);
+        self.tell_n();
+        Ok(())
+    }
+
+    /// Draws one pinhole view.
+    fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3]) -> Result<Picture, Error> {
+        let size_px = camera.size_px;
+        let view = self.gpu.uniform_with("splat.draw_view", &camera.view());
+        let background = Supervision { background_srgb, ..bytemuck::Zeroable::zeroed() };
+        self.gpu.write(&self.plain, 0, bytemuck::bytes_of(&background));
+        loop {
+            let need = self.scratch_need(size_px, false);
+            self.ensure_scratch(need)?;
+            ensure_frame(&self.gpu, &mut self.draw_frame, &mut self.passes, size_px, false)?;
+            let (Some((_, scratch)), Some(frame)) = (&self.scratch, &self.draw_frame) else { return Err(Error::DeviceLost) };
+            let passes = ViewPasses { gpu: &self.gpu, splats: &self.splats, scratch, frame, status: &self.draw_status, view: &view, size_px };
+            passes.draw(&mut self.passes, &self.draw, &self.draw.rasterize);
+            passes.finish(&mut self.passes, &self.draw, &self.plain);
+            self.passes.submit(&self.gpu);
+            let counters: Vec<u32> = self.gpu.read(&self.draw_status, status::LEN)?;
+            if self.mend(&counters)? {
+                self.gpu.write(&self.draw_status, 4 * status::FAILED as u64, &[0; 12]);
+                continue;
+            }
+            let Some(frame) = &self.draw_frame else { return Err(Error::DeviceLost) };
+            let n = (size_px[0] * size_px[1]) as usize;
+            let pixels: Vec<u32> = self.gpu.read(&frame.pixels, n)?;
+            let depth_m = self.gpu.read(&frame.depths, n)?;
+            return Ok(Picture { size_px, rgba_srgb: bytemuck::cast_slice(&pixels).to_vec(), depth_m });
+        }
+    }
+}
+
+impl Method for SplatTrainer {
+    fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
+        if keyframe.split == Split::Test {
+            return Ok(());
+        }
+        self.settle()?;
+        self.seed_from(&keyframe)?;
+        self.views.push(TrainView::new(keyframe));
+        self.measure_scene();
+        Ok(())
+    }
+
+    fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
+        self.views.retain(|view| view.keyframe.camera.as_ref() != camera || view.keyframe.stamp != stamp);
+        self.passes.forget_bindings();
+        Ok(())
+    }
+
+    fn step(&mut self, n: u64) -> Result<u64, Error> {
+        if self.views.is_empty() {
+            return Ok(0);
+        }
+        self.begin_learning()?;
+        if self.splats.n_splats == 0 {
+            return Ok(0);
+        }
+        let learn = self.learn()?;
+        self.grow_when_due(&learn)?;
+        let by_time = if self.step_millis > 0.0 { (SUBMIT_MILLIS / self.step_millis) as u64 } else { 1 };
+        let to_change = GROWTH_PERIOD - self.step % GROWTH_PERIOD; // Growth and degrees change at multiples of it.
+        let asked = n;
+        let n = n.min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT)).min(to_change);
+        self.splats.set_active_degree(&self.gpu, u32::try_from(self.step / SH_PERIOD).unwrap_or(3).min(3));
+        self.write_rule();
+        let since = Instant::now();
+        for step in self.step..self.step + n {
+            self.record_step(&learn, step)?;
+        }
+        self.passes.submit(&self.gpu);
+        let status = self.gpu.begin_read(&self.learn_status, status::LEN);
+        self.step += n;
+        self.settle()?; // The submit before; this one runs meanwhile.
+        self.in_flight = Some(InFlight { status, n_steps: n, since });
+        if n == asked {
+            self.settle()?; // The caller stops here: the count must be true.
+        }
+        Ok(n)
+    }
+
+    fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
+        match request.projection {
+            Projection::Pinhole { focal_px, principal_px } => {
+                let camera = Camera {
+                    world_from_camera: request.world_from_camera,
+                    size_px: request.size_px,
+                    focal_px,
+                    principal_px,
+                    shutter: request.shutter,
+                    near_m: request.near_m,
+                    far_m: request.far_m,
+                    crop: request.crop,
+                };
+                self.draw_view(&camera, request.background_srgb)
+            }
+            Projection::Equirectangular => super::equirect::render(request, |camera| self.draw_view(camera, request.background_srgb)),
+        }
+    }
+
+    fn progress(&self) -> Progress {
+        Progress { step: self.step, primitives: self.splats.n_splats.into(), bytes: self.splats.bytes(), step_millis: self.step_millis }
+    }
+
+    fn save(&mut self, folder: &Path) -> Result<(), Error> {
+        let arrays = self.arrays()?;
+        std::fs::create_dir_all(folder).map_err(|source| Error::Write { path: folder.to_owned(), source })?;
+        ply::write(&folder.join("splats.ply"), &arrays)?;
+        let about = serde_json::json!({ "method": "splat", "steps": self.step, "splats": arrays.n_splats(), "sh_degree": arrays.sh_degree, "seed": self.options.seed });
+        let path = folder.join("model.json");
+        std::fs::write(&path, format!("{about:#}\n")).map_err(|source| Error::Write { path, source })
+    }
+}
+
+fn ensure_frame(gpu: &Gpu, frame: &mut Option<Frame>, passes: &mut Passes, size_px: [u32; 2], learned: bool) -> Result<(), Error> {
+    let (n_pixels, n_tiles) = (size_px[0] * size_px[1], n_tiles(size_px));
+    if frame.as_ref().is_none_or(|frame| frame.n_pixels < n_pixels || frame.n_tiles < n_tiles) {
+        let have = frame.as_ref().map_or((0, 0), |frame| (frame.n_pixels, frame.n_tiles));
+        passes.submit(gpu);
+        passes.forget_bindings();
+        *frame = None;
+        *frame = Some(Frame::new(gpu, n_pixels.max(have.0), n_tiles.max(have.1), learned)?);
+    }
+    Ok(())
+}
+
+/// Which view a step learns from: every view once in a shuffled order, then again in another.
+fn pick(step: u64, n_views: usize, seed: u64) -> usize {
+    let n = n_views as u64;
+    let (round, place) = (step / n, step % n);
+    let mut order: Vec<usize> = (0..n_views).collect();
+    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ round.wrapping_mul(0xd134_2543_de82_ef95);
+    for at in (1..n_views).rev() {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        order.swap(at, ((state >> 33) % (at as u64 + 1)) as usize);
+    }
+    order[place as usize]
+}
+
+/// `n` of the splats, evenly over their list.
+fn spread_out(arrays: &SplatArrays, n: usize) -> SplatArrays {
+    let picks: Vec<usize> = (0..n).map(|ix| ix * arrays.n_splats() / n).collect();
+    let n_coeffs = arrays.n_coefficients();
+    SplatArrays {
+        means: picks.iter().map(|ix| arrays.means[*ix]).collect(),
+        log_scales: picks.iter().map(|ix| arrays.log_scales[*ix]).collect(),
+        rotations_wxyz: picks.iter().map(|ix| arrays.rotations_wxyz[*ix]).collect(),
+        opacity_logits: picks.iter().map(|ix| arrays.opacity_logits[*ix]).collect(),
+        sh: picks.iter().flat_map(|ix| arrays.sh[ix * n_coeffs..(ix + 1) * n_coeffs].iter().copied()).collect(),
+        sh_degree: arrays.sh_degree,
+    }
+}
+
+fn median_depth_m(keyframe: &Keyframe) -> Option<f64> {
+    let depth = keyframe.depth.as_ref()?;
+    let mut sample: Vec<f32> = depth.depth_m.iter().copied().step_by(997).filter(|z| *z > 0.0).collect();
+    sample.sort_by(f32::total_cmp);
+    sample.get(sample.len() / 2).map(|z| f64::from(*z))
+}

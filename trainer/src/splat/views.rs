@@ -1,0 +1,144 @@
+//! Keyframes on the GPU, at the resolutions they are learned from.
+
+use super::params::Camera;
+use crate::gpu::{Buffer, Gpu, f32_of};
+use crate::{Error, Keyframe, Shutter};
+use nalgebra::Point3;
+use std::sync::Arc;
+
+/// Nearest and furthest a splat may be from a keyframe's camera along z to be learned from it, metres.
+const NEAR_M: f64 = 0.01;
+const FAR_M: f64 = 1e4;
+
+/// One keyframe that is learned from.
+#[derive(Debug)]
+pub(crate) struct TrainView {
+    pub(crate) keyframe: Arc<Keyframe>,
+    levels: [Option<Level>; 3],
+}
+
+/// One keyframe at one resolution.
+#[derive(Debug)]
+pub(crate) struct Level {
+    pub(crate) size_px: [u32; 2],
+    pub(crate) view: Buffer,
+    /// rgba8; a = 0 where masked.
+    pub(crate) image: Buffer,
+    /// Metres along z in the color camera, 0 where unknown.
+    pub(crate) depth: Buffer,
+}
+
+impl TrainView {
+    pub(crate) fn new(keyframe: Arc<Keyframe>) -> Self {
+        Self { keyframe, levels: [const { None }; 3] }
+    }
+
+    /// The keyframe `2^level` times smaller, uploaded at first use.
+    pub(crate) fn level(&mut self, gpu: &Gpu, level: u32) -> Result<&Level, Error> {
+        let slot = &mut self.levels[level as usize];
+        let made = match slot.take() {
+            Some(made) => made,
+            None => Level::new(gpu, &self.keyframe, level)?,
+        };
+        Ok(slot.insert(made))
+    }
+}
+
+impl Level {
+    fn new(gpu: &Gpu, keyframe: &Keyframe, level: u32) -> Result<Self, Error> {
+        let camera = camera_of(keyframe).at_level(level);
+        let (image, depth) = (shrunk_image(keyframe, camera.size_px, level), shrunk_depth(keyframe, camera.size_px, level));
+        Ok(Self {
+            size_px: camera.size_px,
+            view: gpu.uniform_with("splat.view", &camera.view()),
+            image: gpu.storage_with("splat.target_image", &image)?,
+            depth: gpu.storage_with("splat.target_depth", bytemuck::cast_slice(&depth))?,
+        })
+    }
+}
+
+/// The camera that took the keyframe.
+pub(crate) fn camera_of(keyframe: &Keyframe) -> Camera {
+    Camera {
+        world_from_camera: keyframe.world_from_camera,
+        size_px: keyframe.size_px,
+        focal_px: keyframe.focal_px,
+        principal_px: keyframe.principal_px,
+        shutter: keyframe.twist.map(|twist| Shutter { twist, readout_secs: keyframe.readout_secs }),
+        near_m: NEAR_M,
+        far_m: FAR_M,
+        crop: None,
+    }
+}
+
+/// Means over squares of pixels; masked where any of them is.
+fn shrunk_image(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Vec<u8> {
+    if level == 0 {
+        return keyframe.rgba_srgb.to_vec();
+    }
+    let width = keyframe.size_px[0] as usize;
+    let edge = 1usize << level;
+    let mut shrunk = Vec::with_capacity(4 * (size_px[0] * size_px[1]) as usize);
+    for y in 0..size_px[1] as usize {
+        for x in 0..size_px[0] as usize {
+            let mut sums = [0u32; 3];
+            let mut seen = true;
+            for row in y * edge..(y + 1) * edge {
+                for pixel in keyframe.rgba_srgb[4 * (row * width + x * edge)..].chunks_exact(4).take(edge) {
+                    seen &= pixel[3] > 0;
+                    for (sum, value) in sums.iter_mut().zip(pixel) {
+                        *sum += u32::from(*value);
+                    }
+                }
+            }
+            let area = (edge * edge) as u32;
+            shrunk.extend(sums.map(|sum| u8::try_from((sum + area / 2) / area).expect("a mean of bytes is a byte")));
+            shrunk.push(if seen { 255 } else { 0 });
+        }
+    }
+    shrunk
+}
+
+/// The reading at the middle of each square: means would invent surfaces between near and far.
+fn shrunk_depth(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Vec<f32> {
+    let full = depth_in_color_view(keyframe);
+    if full.is_empty() {
+        return vec![0.0; (size_px[0] * size_px[1]) as usize];
+    }
+    let width = keyframe.size_px[0] as usize;
+    let (edge, middle) = (1usize << level, (1usize << level) / 2);
+    (0..size_px[1] as usize).flat_map(|y| (0..size_px[0] as usize).map(move |x| (x, y))).map(|(x, y)| full[(y * edge + middle) * width + x * edge + middle]).collect()
+}
+
+/// Depth along the color camera's z for each of its pixels; empty where the keyframe has none.
+///
+/// A depth camera with its own lens, pose or moment is carried over point by point; the nearest wins.
+fn depth_in_color_view(keyframe: &Keyframe) -> Vec<f32> {
+    let Some(depth) = &keyframe.depth else { return Vec::new() };
+    let same_lens = depth.size_px == keyframe.size_px && depth.focal_px == keyframe.focal_px && depth.principal_px == keyframe.principal_px;
+    if same_lens && depth.world_from_camera == keyframe.world_from_camera {
+        return depth.depth_m.to_vec();
+    }
+    let color_from_depth = keyframe.world_from_camera.inverse() * depth.world_from_camera;
+    let [width, height] = keyframe.size_px;
+    let mut carried = vec![0.0f32; (width * height) as usize];
+    for (ix, z) in depth.depth_m.iter().enumerate().filter(|(_, z)| **z > 0.0) {
+        let (x, y) = ((ix as u32 % depth.size_px[0]), (ix as u32 / depth.size_px[0]));
+        let ray = |pixel: u32, axis: usize| (f64::from(pixel) + 0.5 - depth.principal_px[axis]) / depth.focal_px[axis];
+        let z = f64::from(*z);
+        let point = color_from_depth * Point3::new(ray(x, 0) * z, ray(y, 1) * z, z);
+        if point.z <= 0.0 {
+            continue;
+        }
+        let pixel = [0, 1].map(|axis| keyframe.focal_px[axis] * point[axis] / point.z + keyframe.principal_px[axis]);
+        if pixel[0] < 0.0 || pixel[1] < 0.0 || pixel[0] >= f64::from(width) || pixel[1] >= f64::from(height) {
+            continue;
+        }
+        let place = &mut carried[pixel[1] as usize * width as usize + pixel[0] as usize];
+        let nearer = f32_of(point.z);
+        if *place == 0.0 || nearer < *place {
+            *place = nearer;
+        }
+    }
+    carried
+}
