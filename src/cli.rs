@@ -1,6 +1,6 @@
 //! The commands and what `--help` says of them; each command's flags stand at the head of its own file.
 
-use crate::commands::{devices, doctor, fk};
+use crate::commands::{bench, devices, doctor, eval, export, fk, metrics, record, render, run, train};
 use clap::{ArgAction, Parser, Subcommand};
 
 /// Turns a robot's cameras and joints into a live radiance field.
@@ -24,8 +24,24 @@ pub(crate) struct Cli {
 /// What to do.
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
+    /// Build a scene model while the robot looks around, and show it in the browser
+    Run(run::Args),
+    /// Write what a rig's devices say to a recording
+    Record(record::Args),
+    /// Train a scene model on a dataset folder or a recording
+    Train(train::Args),
+    /// Draw pictures from a saved model
+    Render(render::Args),
+    /// Score a saved model on test images
+    Eval(eval::Args),
+    /// Compare two pictures
+    Metrics(metrics::Args),
+    /// Write a model or a recording in the formats of other programs
+    Export(export::Args),
     /// Compute where a robot's tip is for given joint values
     Fk(fk::Args),
+    /// Measure how fast the kernels are
+    Bench(bench::Args),
     /// List what is plugged in and what of it can be used
     Devices(devices::Args),
     /// Check GPU, clocks, memory and permissions, and name the line that mends what is amiss

@@ -1,5 +1,6 @@
 //! Exit codes, and which error means which.
 
+use crate::config::ConfigError;
 use std::io::ErrorKind;
 use std::process::ExitCode;
 
@@ -13,6 +14,10 @@ pub(crate) enum Exit {
     Failed = 1,
     /// The arguments, or the rig file they name, make no sense.
     BadArguments = 2,
+    /// Done, but something was lost on the way.
+    Loss = 3,
+    /// Not done: what came in does not suffice.
+    Refused = 4,
 }
 
 impl From<Exit> for ExitCode {
@@ -26,9 +31,20 @@ impl From<Exit> for ExitCode {
 #[error("{0}")]
 pub(crate) struct BadArgument(pub(crate) String);
 
+/// What came in does not suffice for a result.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub(crate) struct LackOfEvidence(pub(crate) String);
+
 /// The exit code of an error.
 pub(crate) fn of(error: &anyhow::Error) -> Exit {
-    if error.chain().any(|cause| cause.is::<BadArgument>()) { Exit::BadArguments } else { Exit::Failed }
+    if error.chain().any(|cause| cause.is::<BadArgument>() || cause.is::<ConfigError>()) {
+        Exit::BadArguments
+    } else if error.chain().any(|cause| cause.is::<LackOfEvidence>()) {
+        Exit::Refused
+    } else {
+        Exit::Failed
+    }
 }
 
 /// Whether whoever read our output went away, as `head` does.

@@ -1,9 +1,27 @@
 //! The `fieldrig` command: parse, run, exit code.
 
+mod camera_path;
 mod cli;
 mod commands;
+mod config;
+mod data;
+mod dataset;
+mod evaluate;
 mod exit;
+mod export;
+mod feed;
+mod holdout;
+mod join;
+mod live;
+mod marks;
+mod method;
+mod open;
 mod print;
+mod run_folder;
+mod scene_hint;
+mod session;
+mod stop;
+mod training_args;
 
 use clap::Parser;
 use std::io::Write;

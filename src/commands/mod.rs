@@ -1,8 +1,16 @@
 //! One file a subcommand.
 
+pub(crate) mod bench;
 pub(crate) mod devices;
 pub(crate) mod doctor;
+pub(crate) mod eval;
+pub(crate) mod export;
 pub(crate) mod fk;
+pub(crate) mod metrics;
+pub(crate) mod record;
+pub(crate) mod render;
+pub(crate) mod run;
+pub(crate) mod train;
 
 use crate::cli::Command;
 use crate::exit::Exit;
@@ -12,7 +20,15 @@ use trainer::gpu::{Gpu, GpuOptions};
 /// Runs a command.
 pub(crate) fn run(command: Command) -> anyhow::Result<Exit> {
     match command {
+        Command::Run(args) => run::run(&args),
+        Command::Record(args) => record::run(&args),
+        Command::Train(args) => train::run(&args),
+        Command::Render(args) => render::run(&args),
+        Command::Eval(args) => eval::run(&args),
+        Command::Metrics(args) => metrics::run(args).map(|()| Exit::Done),
+        Command::Export(args) => export::run(&args),
         Command::Fk(args) => fk::run(args).map(|()| Exit::Done),
+        Command::Bench(args) => bench::run(&args).map(|()| Exit::Done),
         Command::Devices(args) => devices::run(&args),
         Command::Doctor(args) => doctor::run(&args),
     }

@@ -66,7 +66,7 @@ impl KeyframeList {
 }
 
 /// The text of a `keyframes.txt`.
-pub(super) fn text_of<'a>(keyframes: impl Iterator<Item = &'a Arc<Keyframe>>) -> String {
+pub(crate) fn text_of<'a>(keyframes: impl Iterator<Item = &'a Arc<Keyframe>>) -> String {
     let mut text = String::from("# camera stamp_nanos split\n");
     for keyframe in keyframes {
         let split = SPLITS.iter().find(|(split, _)| *split == keyframe.split).map_or("train", |(_, name)| name);

@@ -15,7 +15,7 @@ mod store;
 mod tests;
 mod waiting;
 
-pub(crate) use list::KeyframeList;
+pub(crate) use list::{KeyframeList, text_of as keyframe_list};
 pub(crate) use refusal::{Counts, Refusal};
 
 use crate::config::{self, CameraDriver, Parent, Rig};

@@ -1,0 +1,130 @@
+//! Where pictures are to be drawn from: one pose, or a camera path of nerfstudio's viewer.
+
+use crate::exit::BadArgument;
+use anyhow::{Context, ensure};
+use kinematics::Transform;
+use nalgebra::{Matrix3, Matrix4, Rotation3, Translation3, UnitQuaternion};
+use serde::Deserialize;
+use std::path::Path;
+
+/// One place to draw from.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Stand {
+    pub(crate) world_from_camera: Transform,
+    /// Angle from the top to the bottom of the picture, radians, where the path says it.
+    pub(crate) fov_y_rad: Option<f64>,
+}
+
+/// A camera path.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct CameraPath {
+    pub(crate) stands: Vec<Stand>,
+    /// Width and height of the pictures, where the path says it.
+    pub(crate) size_px: Option<[u32; 2]>,
+}
+
+/// As nerfstudio writes it.
+#[derive(Debug, Deserialize)]
+struct PathFile {
+    render_height: Option<u32>,
+    render_width: Option<u32>,
+    camera_path: Vec<PathStand>,
+}
+
+#[derive(Debug, Deserialize)]
+struct PathStand {
+    /// Row major; the camera looks along -z with y up.
+    camera_to_world: Vec<f64>,
+    /// From top to bottom, degrees.
+    fov: Option<f64>,
+}
+
+impl CameraPath {
+    /// Reads a nerfstudio camera path; its cameras are turned to ours.
+    pub(crate) fn load(path: &Path) -> anyhow::Result<Self> {
+        let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+        Self::parse(&text).with_context(|| format!("{} is no nerfstudio camera path", path.display()))
+    }
+
+    /// One pose, 16 numbers row major, `world_from_camera` with the axes of [`kinematics::camera`].
+    pub(crate) fn of_pose(numbers: &[f64]) -> Result<Self, BadArgument> {
+        let world_from_camera = rigid(numbers).map_err(|error| BadArgument(format!("--pose: {error}")))?;
+        Ok(Self { stands: vec![Stand { world_from_camera, fov_y_rad: None }], size_px: None })
+    }
+
+    fn parse(text: &str) -> anyhow::Result<Self> {
+        let file: PathFile = serde_json::from_str(text)?;
+        ensure!(!file.camera_path.is_empty(), "it has no cameras");
+        let stand = |(ix, stand): (usize, &PathStand)| {
+            let world_from_opengl = rigid(&stand.camera_to_world).with_context(|| format!("camera {ix}"))?;
+            let opengl_from_camera = drivers::dataset::nerfstudio::opengl_from_camera();
+            anyhow::Ok(Stand {
+                world_from_camera: world_from_opengl * opengl_from_camera,
+                fov_y_rad: stand.fov.map(f64::to_radians),
+            })
+        };
+        Ok(Self {
+            stands: file.camera_path.iter().enumerate().map(stand).collect::<Result<_, _>>()?,
+            size_px: file.render_width.zip(file.render_height).map(|(width, height)| [width, height]),
+        })
+    }
+}
+
+/// The rigid motion of a 4x4 matrix, row major.
+fn rigid(numbers: &[f64]) -> anyhow::Result<Transform> {
+    /// Files round to six digits or so.
+    const ABS: f64 = 1e-3;
+    ensure!(numbers.len() == 16, "a pose has 16 numbers, got {}", numbers.len());
+    ensure!(numbers.iter().all(|number| number.is_finite()), "a number of the pose is not finite");
+    let matrix = Matrix4::from_row_slice(numbers);
+    let rotation: Matrix3<f64> = matrix.fixed_view::<3, 3>(0, 0).into();
+    let off = (rotation * rotation.transpose() - Matrix3::identity()).amax();
+    ensure!(off < ABS && rotation.determinant() > 0.0, "its upper left 3x3 is no rotation");
+    ensure!(
+        (matrix.row(3) - nalgebra::RowVector4::new(0.0, 0.0, 0.0, 1.0)).amax() < ABS,
+        "its last row is not 0 0 0 1"
+    );
+    let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&rotation));
+    Ok(Transform::from_parts(Translation3::new(matrix[(0, 3)], matrix[(1, 3)], matrix[(2, 3)]), rotation))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Point3;
+
+    const IDENTITY: [f64; 16] = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+
+    #[test]
+    fn a_nerfstudio_camera_looks_along_minus_z_with_y_up() {
+        let text = serde_json::json!({
+            "render_height": 480, "render_width": 640,
+            "camera_path": [{ "camera_to_world": [1, 0, 0, 1, 0, 1, 0, 2, 0, 0, 1, 3, 0, 0, 0, 1], "fov": 90.0, "aspect": 1.33 }],
+        });
+        let path = CameraPath::parse(&text.to_string()).expect("a path");
+        assert_eq!(path.size_px, Some([640, 480]));
+        let stand = path.stands[0];
+        assert_eq!(stand.fov_y_rad, Some(std::f64::consts::FRAC_PI_2));
+        let ahead_in_world = stand.world_from_camera * Point3::new(0.0, 0.0, 1.0);
+        assert!((ahead_in_world - Point3::new(1.0, 2.0, 2.0)).norm() < 1e-12, "{ahead_in_world}");
+        let below_in_world = stand.world_from_camera * Point3::new(0.0, 1.0, 0.0);
+        assert!((below_in_world - Point3::new(1.0, 1.0, 3.0)).norm() < 1e-12, "{below_in_world}");
+    }
+
+    #[test]
+    fn what_is_no_pose_is_told() {
+        assert!(CameraPath::of_pose(&IDENTITY).is_ok());
+        let mut stretched = IDENTITY;
+        stretched[0] = 2.0;
+        let mut mirrored = IDENTITY;
+        mirrored[0] = -1.0;
+        let mut unknown = IDENTITY;
+        unknown[3] = f64::NAN;
+        for (numbers, word) in
+            [(&IDENTITY[..15], "16 numbers"), (&stretched, "rotation"), (&mirrored, "rotation"), (&unknown, "finite")]
+        {
+            let error = CameraPath::of_pose(numbers).expect_err(word).to_string();
+            assert!(error.contains(word), "{error}");
+        }
+    }
+}

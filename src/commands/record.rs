@@ -1,0 +1,112 @@
+//! `fieldrig record`: what the devices say, into a file, and nothing else.
+
+use crate::config::{Override, Rig};
+use crate::exit::Exit;
+use crate::open::{self, Devices, Opened};
+use crate::print;
+use crate::stop::Stop;
+use anyhow::Context;
+use drivers::Sample;
+use kinematics::Stamp;
+use serde::Serialize;
+use std::path::PathBuf;
+
+/// Flags of `record`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Cameras and arm (TOML)
+    rig_file: PathBuf,
+    /// The recording, an MCAP file that Foxglove and Lichtblick open too
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Put a simulated twin in the place of every device of the rig file
+    #[arg(long)]
+    sim: bool,
+    /// Simulate as fast as the machine can, without losing anything; else in real time
+    #[arg(long, requires = "sim")]
+    lockstep: bool,
+    /// Stop after S seconds of the devices' time [default: until Ctrl-C or the devices' end]
+    #[arg(long, value_name = "S")]
+    seconds: Option<f64>,
+    /// Print one JSON object a line
+    #[arg(long)]
+    json: bool,
+}
+
+/// What was recorded.
+#[derive(Debug, Default, Serialize)]
+struct Recorded {
+    event: &'static str,
+    seconds: f64,
+    images: u64,
+    images_lost_by_devices: u64,
+    joint_states: u64,
+    base_poses: u64,
+    truths: u64,
+    out: PathBuf,
+}
+
+impl Recorded {
+    fn count(&mut self, sample: &Sample) {
+        match sample {
+            Sample::Image(image) => {
+                self.images += 1;
+                self.images_lost_by_devices += image.n_skipped;
+            }
+            Sample::Joints(_) => self.joint_states += 1,
+            Sample::Base(_) => self.base_poses += 1,
+            Sample::Truth(_) => self.truths += 1,
+        }
+    }
+}
+
+/// Records until the time is over, the devices end, or Ctrl-C.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let stop = Stop::on_ctrl_c()?;
+    let overrides = if args.lockstep { vec![Override::new("sim.lockstep", true)] } else { Vec::new() };
+    let rig = Rig::load(&args.rig_file, &overrides)?;
+    let Opened { rig, mut source, .. } = open::rig(rig, if args.sim { Devices::Sim } else { Devices::Real })?;
+    let mut recorder = open::recorder(&args.out, &rig)?;
+    let mut recorded = Recorded { event: "done", out: args.out.clone(), ..Recorded::default() };
+    let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
+    let mut first: Option<Stamp> = None;
+    let mut input_error = None;
+    while !stop.asked() {
+        let sample = match source.next_sample() {
+            Ok(Some(sample)) => sample,
+            Ok(None) => break,
+            Err(error) => {
+                input_error = Some(error);
+                break;
+            }
+        };
+        let since_first = sample.stamp().0 - first.get_or_insert(sample.stamp()).0;
+        recorded.seconds = recorded.seconds.max(since_first as f64 * 1e-9);
+        if args.seconds.is_some_and(|seconds| recorded.seconds > seconds) {
+            break;
+        }
+        recorder
+            .write(&sample)
+            .with_context(|| format!("{} holds the first {:.1} s only", args.out.display(), recorded.seconds))?;
+        recorded.count(&sample);
+        bar.set_message(format!("{} images, {} joint states", recorded.images, recorded.joint_states));
+    }
+    bar.finish_and_clear();
+    recorder.finish().with_context(|| format!("{} has no index, but can be read", args.out.display()))?;
+    if let Some(error) = input_error {
+        return Err(anyhow::Error::new(error)
+            .context(format!("the devices broke off; {} keeps what came before", args.out.display())));
+    }
+    if args.json {
+        print::json(&recorded)?;
+    } else {
+        print::line(format_args!(
+            "{:.1} s, {} images, {} joint states in {}",
+            recorded.seconds,
+            recorded.images,
+            recorded.joint_states,
+            args.out.display()
+        ))?;
+    }
+    Ok(if recorded.images_lost_by_devices > 0 { Exit::Loss } else { Exit::Done })
+}

@@ -1,0 +1,185 @@
+//! `fieldrig render`: pictures from a saved model.
+
+use crate::camera_path::{CameraPath, Stand};
+use crate::exit::{BadArgument, Exit};
+use crate::{method, print};
+use anyhow::Context;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use trainer::{Aabb, Picture, Projection, RenderRequest};
+
+/// Size of a picture where nobody says one.
+const USUAL_SIZE_PX: [u32; 2] = [1280, 720];
+/// Largest side of a picture: 16 k.
+const MAX_SIDE_PX: u32 = 16_384;
+
+/// Flags of `render`.
+#[derive(Debug, clap::Args)]
+#[command(group(clap::ArgGroup::new("where").required(true)))]
+pub(crate) struct Args {
+    /// Folder of a saved model
+    model: PathBuf,
+    /// Camera path as nerfstudio writes it (JSON)
+    #[arg(long, value_name = "FILE", group = "where")]
+    camera_path: Option<PathBuf>,
+    /// world_from_camera, 16 numbers row major, separated by spaces or commas; camera: x right, y down, z forward
+    #[arg(long, value_name = "NUMBERS", group = "where", allow_hyphen_values = true, value_parser = numbers::<16>)]
+    pose: Option<Numbers<16>>,
+    /// Size of the pictures [default: the camera path's, else 1280x720]
+    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = size)]
+    size: Option<[u32; 2]>,
+    /// Angle from the top to the bottom of the picture, degrees [default: the camera path's, else 60]
+    #[arg(long, value_name = "DEGREES")]
+    fov: Option<f64>,
+    /// Draw all directions (360 degrees) instead of a pinhole view
+    #[arg(long, conflicts_with = "fov")]
+    equirect: bool,
+    /// Draw only what lies in a box in the world: x y z of the lowest corner, then of the highest, metres
+    #[arg(long, value_name = "NUMBERS", allow_hyphen_values = true, value_parser = numbers::<6>)]
+    crop: Option<Numbers<6>>,
+    /// Write depth too, metres along the camera's z axis (distance with --equirect), as .npy
+    #[arg(long)]
+    depth: bool,
+    /// Folder for the pictures
+    #[arg(long, value_name = "FOLDER", default_value = "renders")]
+    out: PathBuf,
+    /// Print one JSON object a picture
+    #[arg(long)]
+    json: bool,
+}
+
+/// A fixed number of numbers from one argument.
+#[derive(Clone, Copy, Debug)]
+struct Numbers<const N: usize>([f64; N]);
+
+fn numbers<const N: usize>(text: &str) -> Result<Numbers<N>, String> {
+    let words = text.split([' ', ',']).filter(|word| !word.is_empty());
+    let values: Vec<f64> =
+        words.map(|word| word.parse().map_err(|_| format!("{word:?} is no number"))).collect::<Result<_, _>>()?;
+    let n = values.len();
+    <[f64; N]>::try_from(values).map(Numbers).map_err(|_| format!("got {n} numbers, expected {N}"))
+}
+
+fn size(text: &str) -> Result<[u32; 2], String> {
+    let sides = text.split_once('x').and_then(|(width, height)| Some([width.parse().ok()?, height.parse().ok()?]));
+    sides
+        .filter(|sides: &[u32; 2]| sides.iter().all(|side| (1..=MAX_SIDE_PX).contains(side)))
+        .ok_or_else(|| format!("expected WIDTHxHEIGHT, such as 1280x720, each side at most {MAX_SIDE_PX}"))
+}
+
+/// What was drawn.
+#[derive(Debug, Serialize)]
+struct Drawn {
+    picture: PathBuf,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    depth: Option<PathBuf>,
+    size_px: [u32; 2],
+}
+
+/// Draws every stand of the path.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let path = match (&args.camera_path, &args.pose) {
+        (Some(file), _) => CameraPath::load(file)?,
+        (None, Some(pose)) => CameraPath::of_pose(&pose.0)?,
+        (None, None) => return Err(BadArgument("either --camera-path or --pose is needed".into()).into()),
+    };
+    let size_px = args.size.or(path.size_px).unwrap_or(USUAL_SIZE_PX);
+    let requests = path.stands.iter().map(|stand| args.request(stand, size_px)).collect::<Result<Vec<_>, _>>()?;
+    let mut model = method::load(super::open_gpu()?, &args.model)?;
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make the folder {}", args.out.display()))?;
+    let bar = print::bar(Some(requests.len() as u64), "{bar:30} {pos} of {len}", args.json);
+    for (ix, request) in requests.iter().enumerate() {
+        let picture = model.render(request)?;
+        let drawn = write(&args.out, ix, &picture, args.depth)?;
+        bar.inc(1);
+        if args.json {
+            print::json(&drawn)?;
+        }
+    }
+    bar.finish_and_clear();
+    if !args.json {
+        print::line(format_args!("{} pictures in {}", requests.len(), args.out.display()))?;
+    }
+    Ok(Exit::Done)
+}
+
+impl Args {
+    fn request(&self, stand: &Stand, size_px: [u32; 2]) -> Result<RenderRequest, BadArgument> {
+        const USUAL_FOV_DEGREES: f64 = 60.0;
+        let fov_y_rad = self.fov.map(f64::to_radians).or(stand.fov_y_rad).unwrap_or(USUAL_FOV_DEGREES.to_radians());
+        if !(fov_y_rad > 0.0 && fov_y_rad < std::f64::consts::PI) {
+            return Err(BadArgument(format!(
+                "field of view {} degrees: must be above 0 and below 180",
+                fov_y_rad.to_degrees()
+            )));
+        }
+        let [width, height] = size_px.map(f64::from);
+        let focal_px = 0.5 * height / (0.5 * fov_y_rad).tan();
+        let pinhole = Projection::Pinhole { focal_px: [focal_px; 2], principal_px: [0.5 * width, 0.5 * height] };
+        Ok(RenderRequest {
+            world_from_camera: stand.world_from_camera,
+            size_px,
+            projection: if self.equirect { Projection::Equirectangular } else { pinhole },
+            shutter: None,
+            near_m: 0.01,
+            far_m: 1000.0,
+            crop: self.crop.map(|Numbers([x, y, z, to_x, to_y, to_z])| Aabb {
+                world_from_box: kinematics::Transform::identity(),
+                min_m: [x, y, z],
+                max_m: [to_x, to_y, to_z],
+            }),
+            background_srgb: [0.0; 3],
+        })
+    }
+}
+
+fn write(folder: &Path, ix: usize, picture: &Picture, with_depth: bool) -> anyhow::Result<Drawn> {
+    let [width, height] = picture.size_px;
+    let file = folder.join(format!("{ix:05}.png"));
+    image::save_buffer(&file, &picture.rgba_srgb, width, height, image::ExtendedColorType::Rgba8)
+        .with_context(|| format!("cannot write {}", file.display()))?;
+    let depth = with_depth.then(|| folder.join(format!("{ix:05}_depth.npy")));
+    if let Some(depth) = &depth {
+        write_npy(depth, picture).with_context(|| format!("cannot write {}", depth.display()))?;
+    }
+    Ok(Drawn { picture: file, depth, size_px: picture.size_px })
+}
+
+/// Depth as `[height, width]` of 32-bit floats.
+fn write_npy(file: &Path, picture: &Picture) -> std::io::Result<()> {
+    use npyz::WriterBuilder;
+    let [width, height] = picture.size_px.map(u64::from);
+    let to = std::io::BufWriter::new(std::fs::File::create(file)?);
+    let mut writer = npyz::WriteOptions::new().default_dtype().shape(&[height, width]).writer(to).begin_nd()?;
+    writer.extend(picture.depth_m.iter())?;
+    writer.finish()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_and_numbers_are_read_or_refused() {
+        assert_eq!(size("640x480"), Ok([640, 480]));
+        for wrong in ["640", "640x", "0x480", "99999x1", "640x480x3"] {
+            assert!(size(wrong).is_err(), "{wrong}");
+        }
+        assert_eq!(numbers::<3>("1, -2 3.5").map(|Numbers(values)| values), Ok([1.0, -2.0, 3.5]));
+        assert!(numbers::<3>("1 2").is_err_and(|error| error.contains("got 2")));
+        assert!(numbers::<1>("one").is_err());
+    }
+
+    #[test]
+    fn depth_files_hold_what_was_drawn() {
+        let folder = tempfile::tempdir().expect("folder");
+        let picture =
+            Picture { size_px: [2, 3], rgba_srgb: vec![255; 24], depth_m: vec![0.0, 1.0, 2.0, 3.0, 4.0, 5.5] };
+        let drawn = write(folder.path(), 7, &picture, true).expect("written");
+        let bytes = std::fs::read(drawn.depth.expect("asked for")).expect("a file");
+        let read = npyz::NpyFile::new(&bytes[..]).expect("npy");
+        assert_eq!(read.shape(), [3, 2]);
+        assert_eq!(read.into_vec::<f32>().expect("floats"), picture.depth_m);
+        assert!(drawn.picture.ends_with("00007.png"));
+    }
+}

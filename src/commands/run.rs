@@ -1,0 +1,195 @@
+//! `fieldrig run`: devices, join, trainer, picture.
+
+use crate::config::{ArmDriver, Override, Rig};
+use crate::evaluate::Evaluator;
+use crate::exit::{Exit, LackOfEvidence};
+use crate::feed::{Feed, Input};
+use crate::join::Join;
+use crate::live::{Live, LiveOptions, Pace};
+use crate::method::{self, Kind};
+use crate::open::{self, Devices, Opened};
+use crate::session::{Evaluators, Limits, Session};
+use crate::stop::Stop;
+use crate::training_args::TrainingArgs;
+use crate::{print, run_folder};
+use anyhow::Context;
+use drivers::Source;
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+use trainer::gpu::Gpu;
+use viz::{Hub, Server, ServerConfig};
+
+/// Flags of `run`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Cameras, arm and training settings (TOML)
+    rig_file: PathBuf,
+    /// Put a simulated twin in the place of every device of the rig file
+    #[arg(long, conflicts_with = "from")]
+    sim: bool,
+    /// Wait with the simulation for the trainer, so that a seed gives one result; else it runs in real time
+    #[arg(long, requires = "sim")]
+    lockstep: bool,
+    /// Replay a recording instead of live devices
+    #[arg(long, value_name = "RECORDING")]
+    from: Option<PathBuf>,
+    /// Write everything that comes in to an MCAP file
+    #[arg(long, value_name = "FILE")]
+    record: Option<PathBuf>,
+    /// Stop after S seconds, counted from the first image [default: run until Ctrl-C]
+    #[arg(long, value_name = "S")]
+    seconds: Option<f64>,
+    /// Stop after N optimiser steps
+    #[arg(long, value_name = "N")]
+    steps: Option<u64>,
+    /// With a lockstep simulation or a recording: steps between two keyframes
+    #[arg(long, value_name = "N", default_value_t = 10)]
+    steps_per_keyframe: u64,
+    #[command(flatten)]
+    training: TrainingArgs,
+    /// Address of the page
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:7007")]
+    listen: SocketAddr,
+    /// Where the results and the settled rig file go [default: runs/<time>]
+    #[arg(long, value_name = "FOLDER")]
+    out: Option<PathBuf>,
+    /// Print one JSON object a line
+    #[arg(long)]
+    json: bool,
+}
+
+/// What the report says beside scores.
+#[derive(Debug, Serialize)]
+struct Particulars {
+    method: &'static str,
+    seed: u64,
+    keyframes: usize,
+    evicted: u64,
+    refused: BTreeMap<&'static str, u64>,
+    device_skipped: u64,
+}
+
+/// Runs until a limit, the end of the devices, or Ctrl-C; saves the model, its keyframes and the settled rig file.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let stop = Stop::on_ctrl_c()?;
+    let rig = Rig::load(&args.rig_file, &args.overrides())?;
+    let kind = Kind::of_rig(&rig)?;
+    let hub = Hub::new();
+    let server = Server::start(ServerConfig { listen: args.listen }, hub.clone())?;
+    args.tell_address(&server.url())?;
+
+    let Opened { rig, source, damage } = args.open(rig)?;
+    let out = run_folder::make(args.out.as_deref())?;
+    rig.write_settled(&out).with_context(|| format!("cannot write into {}", out.display()))?;
+    let feed = Feed::start(args.input(&rig, source)?, hub.clone(), stop.clone())?;
+    let gpu = super::open_gpu()?;
+    let notes = notes(&gpu);
+    let method = kind.start(gpu.clone(), method::options(&rig.train, args.steps)?)?;
+    let evaluators = Evaluators { at_marks: Evaluator::psnr_only(), at_end: Evaluator::thorough(None)? };
+    let limits = Limits { seconds: args.seconds, steps: args.steps };
+    let session = Session::new(gpu, method, evaluators, limits, args.json);
+    let options = LiveOptions {
+        pace: args.pace(&rig),
+        method_name: kind.name(),
+        start_keyframes: rig.join.start_keyframes,
+        notes,
+    };
+
+    let mut live = Live::new(session, feed, hub, options);
+    while !stop.asked() && !live.is_over() {
+        live.take_keyframes()?;
+        live.step()?;
+        live.render();
+        live.publish()?;
+    }
+    stop.ask();
+    save(live, &rig, kind, &out, &damage)
+}
+
+/// Saves what there is, then tells what went wrong on the way.
+fn save(live: Live, rig: &Rig, kind: Kind, out: &Path, damage: &OnceLock<String>) -> anyhow::Result<Exit> {
+    let n_keyframes = live.n_keyframes();
+    let (session, leftover) = live.finish();
+    let leftover = leftover?;
+    let counts = leftover.join.counts();
+    log::info!("{counts}");
+    leftover.join.write_list(&out.join("keyframes.txt"))?;
+    let particulars = Particulars {
+        method: kind.name(),
+        seed: rig.train.seed,
+        keyframes: n_keyframes,
+        evicted: counts.evicted,
+        refused: counts.refused.iter().map(|(why, n)| (why.name(), *n)).collect(),
+        device_skipped: counts.device_skipped,
+    };
+    if n_keyframes > 0 {
+        session.finish(out, &particulars)?;
+    }
+    if let Some(error) = leftover.input_error {
+        return Err(anyhow::Error::new(error).context("the devices broke off"));
+    }
+    if n_keyframes == 0 {
+        return Err(LackOfEvidence(format!("no keyframe was accepted: {counts}")).into());
+    }
+    let losses =
+        [leftover.recording_error.map(|error| format!("the recording is cut off: {error}")), damage.get().cloned()];
+    for loss in losses.iter().flatten() {
+        log::warn!("{loss}");
+    }
+    Ok(if losses.iter().any(Option::is_some) { Exit::Loss } else { Exit::Done })
+}
+
+impl Args {
+    fn overrides(&self) -> Vec<Override> {
+        let mut overrides = self.training.overrides();
+        if self.lockstep {
+            overrides.push(Override::new("sim.lockstep", true));
+        }
+        overrides
+    }
+
+    fn tell_address(&self, url: &str) -> anyhow::Result<()> {
+        if self.json {
+            return print::json(&serde_json::json!({ "event": "serving", "url": url }));
+        }
+        Ok(print::line(format_args!("open {url} in a browser"))?)
+    }
+
+    fn open(&self, rig: Rig) -> anyhow::Result<Opened> {
+        match &self.from {
+            Some(recording) => open::recording(recording, Some(rig), &[]),
+            None => open::rig(rig, if self.sim { Devices::Sim } else { Devices::Real }),
+        }
+    }
+
+    fn input(&self, rig: &Rig, source: Box<dyn Source>) -> anyhow::Result<Input> {
+        Ok(Input {
+            source,
+            join: Join::new(rig)?,
+            recorder: self.record.as_deref().map(|file| open::recorder(file, rig)).transpose()?,
+            lenses: rig
+                .cameras
+                .iter()
+                .map(|camera| (camera.name.clone(), (camera.intrinsics.focal_px, camera.intrinsics.principal_px)))
+                .collect(),
+        })
+    }
+
+    /// A recording has no clock of its own, a lockstep simulation waits; everything else goes on without us.
+    fn pace(&self, rig: &Rig) -> Pace {
+        let simulated = rig.arm.driver == ArmDriver::Sim;
+        if self.from.is_some() || (simulated && rig.sim.lockstep) {
+            Pace::Lockstep { steps_per_keyframe: self.steps_per_keyframe }
+        } else {
+            Pace::RealTime
+        }
+    }
+}
+
+/// What people at the page should know.
+fn notes(gpu: &Gpu) -> Vec<String> {
+    if gpu.is_software() { vec!["no GPU: kernels run on the CPU, slowly".to_owned()] } else { Vec::new() }
+}

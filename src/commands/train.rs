@@ -1,0 +1,128 @@
+//! `fieldrig train`: a model of a dataset folder or a recording.
+
+use crate::data::{Data, DataArgs};
+use crate::evaluate::Evaluator;
+use crate::exit::{BadArgument, Exit};
+use crate::method::{Kind, options};
+use crate::run_folder;
+use crate::session::{Evaluators, Limits, Session};
+use crate::stop::Stop;
+use crate::training_args::TrainingArgs;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+use trainer::Split;
+use trainer::splat::SplatOptions;
+
+/// Flags of `train`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// A nerfstudio or TUM RGB-D folder, or a recording (.mcap)
+    data: PathBuf,
+    #[command(flatten)]
+    training: TrainingArgs,
+    /// Stop after S seconds of training; loading and scoring do not count [default: 120, unless --steps is given]
+    #[arg(long, value_name = "S")]
+    seconds: Option<f64>,
+    /// Stop after N optimiser steps; no decision reads the clock then
+    #[arg(long, value_name = "N")]
+    steps: Option<u64>,
+    #[command(flatten)]
+    images: DataArgs,
+    /// Weights of LPIPS for SqueezeNet (safetensors) [default: the file named by FIELDRIG_LPIPS_WEIGHTS; none: no LPIPS]
+    #[arg(long, value_name = "FILE")]
+    lpips_weights: Option<PathBuf>,
+    /// Where the results go [default: runs/<time>]
+    #[arg(long, value_name = "FOLDER")]
+    out: Option<PathBuf>,
+    /// Print one JSON object a line
+    #[arg(long)]
+    json: bool,
+}
+
+/// What the report says beside scores.
+#[derive(Debug, Serialize)]
+struct Particulars<'a> {
+    method: &'static str,
+    data: &'a Path,
+    seed: u64,
+    startup_secs: f64,
+    n_train: usize,
+    n_selection: usize,
+    n_test: usize,
+    losses: &'a [String],
+}
+
+/// Loads, trains until a limit or Ctrl-C, scores at the marks, saves.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let started = Instant::now();
+    let limits = args.limits()?;
+    let stop = Stop::on_ctrl_c()?;
+    let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
+    let evaluators = Evaluators { at_marks: evaluator.clone(), at_end: evaluator };
+    let data = Data::load(&args.data, &args.images, &args.training.overrides(), args.json)?;
+    let gpu = super::open_gpu()?;
+    let (kind, options) = args.model(&data)?;
+    let seed = options.seed;
+    let method = kind.start(gpu.clone(), options)?;
+    let out = run_folder::make(args.out.as_deref())?;
+    run_folder::write_keyframe_list(&out.join("keyframes.txt"), &data.keyframes)?;
+    if let Some(rig) = &data.rig {
+        rig.write_settled(&out)?;
+    }
+
+    let mut session = Session::new(gpu, method, evaluators, limits, args.json);
+    let clock_starts = Instant::now();
+    session.start_clock(clock_starts);
+    for keyframe in &data.keyframes {
+        session.push(keyframe)?;
+    }
+    while !stop.asked() && !session.is_over() {
+        session.step(u64::MAX)?;
+    }
+
+    for loss in &data.losses {
+        log::warn!("{loss}");
+    }
+    session.finish(
+        &out,
+        &Particulars {
+            method: kind.name(),
+            data: &args.data,
+            seed,
+            startup_secs: (clock_starts - started).as_secs_f64(),
+            n_train: data.of_split(Split::Train).len(),
+            n_selection: data.of_split(Split::Selection).len(),
+            n_test: data.of_split(Split::Test).len(),
+            losses: &data.losses,
+        },
+    )?;
+    Ok(if data.losses.is_empty() { Exit::Done } else { Exit::Loss })
+}
+
+impl Args {
+    fn limits(&self) -> Result<Limits, BadArgument> {
+        const USUAL_SECONDS: f64 = 120.0;
+        if self.seconds.is_some_and(|seconds| !(seconds >= 0.0)) {
+            return Err(BadArgument("--seconds: must be a number of at least 0".into()));
+        }
+        let seconds = self.seconds.or(self.steps.is_none().then_some(USUAL_SECONDS));
+        Ok(Limits { seconds, steps: self.steps })
+    }
+
+    /// The scene model: the recording's rig file says which, with the flags over it; a folder has the flags only.
+    fn model(&self, data: &Data) -> Result<(Kind, SplatOptions), BadArgument> {
+        if let Some(rig) = &data.rig {
+            return Ok((Kind::of_rig(rig)?, options(&rig.train, self.steps)?));
+        }
+        let usual = SplatOptions::default();
+        let options = SplatOptions {
+            seed: self.training.seed.map_or(usual.seed, u64::from),
+            max_splats: self.training.max_splats.unwrap_or(usual.max_splats),
+            max_bytes: self.training.max_bytes,
+            n_planned_steps: self.steps.unwrap_or(usual.n_planned_steps),
+            ..usual
+        };
+        Ok((self.training.method.unwrap_or(Kind::Splat), options))
+    }
+}

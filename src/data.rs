@@ -1,0 +1,173 @@
+//! What `train` and `eval` work on: a dataset folder or a recording, as keyframes in host memory.
+
+use crate::config::{Override, Rig};
+use crate::dataset;
+use crate::exit::{BadArgument, LackOfEvidence};
+use crate::holdout::Holdout;
+use crate::join::{Join, JoinEvent, KeyframeList};
+use crate::open::{self, Opened};
+use crate::print;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use trainer::{Keyframe, Split};
+
+/// Ending of a recording.
+const RECORDING_ENDING: &str = "mcap";
+
+/// Which images of the data are taken, and what for.
+#[derive(Clone, Debug, clap::Args)]
+pub(crate) struct DataArgs {
+    /// Hold out every N-th image for testing, or the images that a file names, one a line [default: 8]
+    #[arg(long, value_name = "N|FILE")]
+    pub(crate) holdout: Option<String>,
+    /// Take exactly the keyframes of a list that an earlier run wrote (keyframes.txt)
+    #[arg(long, value_name = "FILE", conflicts_with = "holdout")]
+    pub(crate) keyframes: Option<PathBuf>,
+    /// Shrink the images to this share of their width and height
+    #[arg(long, value_name = "SHARE", default_value_t = 1.0)]
+    pub(crate) scale: f64,
+}
+
+/// Keyframes and what to know of them.
+pub(crate) struct Data {
+    /// In the order of the data.
+    pub(crate) keyframes: Vec<Arc<Keyframe>>,
+    /// Names of the images, in the same order.
+    pub(crate) names: Vec<String>,
+    /// The rig that recorded them; a folder has none.
+    pub(crate) rig: Option<Rig>,
+    /// What was lost on the way; anything here makes the exit code 3.
+    pub(crate) losses: Vec<String>,
+}
+
+impl Data {
+    /// Reads a folder, or a recording through the join.
+    pub(crate) fn load(path: &Path, args: &DataArgs, overrides: &[Override], quiet: bool) -> anyhow::Result<Self> {
+        if !(args.scale > 0.0 && args.scale <= 1.0) {
+            return Err(BadArgument(format!("--scale {}: must be above 0 and at most 1", args.scale)).into());
+        }
+        let list = args.keyframes.as_deref().map(KeyframeList::load).transpose()?;
+        let is_recording = path.extension().is_some_and(|ending| ending == RECORDING_ENDING);
+        let mut data = if is_recording {
+            Self::from_recording(path, args, list.clone(), overrides, quiet)?
+        } else {
+            Self::from_folder(path, args, quiet)?
+        };
+        if let Some(list) = &list {
+            data.take_only(list);
+        }
+        if !data.keyframes.iter().any(|keyframe| keyframe.split == Split::Train) {
+            return Err(LackOfEvidence(format!("{}: no image to train on", path.display())).into());
+        }
+        Ok(data)
+    }
+
+    /// Keyframes of one split.
+    pub(crate) fn of_split(&self, split: Split) -> Vec<Arc<Keyframe>> {
+        self.keyframes.iter().filter(|keyframe| keyframe.split == split).cloned().collect()
+    }
+
+    fn from_folder(path: &Path, args: &DataArgs, quiet: bool) -> anyhow::Result<Self> {
+        let folder = drivers::dataset::read(path)?;
+        let holdout = args.holdout.as_deref().map(Holdout::from_argument).transpose()?.unwrap_or_default();
+        let bar = print::bar(Some(folder.frames.len() as u64), "{bar:30} {pos} of {len} images", quiet);
+        let loaded = dataset::load(&folder, &holdout, args.scale, &|n_done| bar.set_position(n_done as u64));
+        bar.finish_and_clear();
+        let loaded = loaded?;
+        for note in &loaded.notes {
+            log::warn!("{note}");
+        }
+        Ok(Self { keyframes: loaded.keyframes, names: loaded.names, rig: None, losses: Vec::new() })
+    }
+
+    fn from_recording(
+        path: &Path,
+        args: &DataArgs,
+        list: Option<KeyframeList>,
+        overrides: &[Override],
+        quiet: bool,
+    ) -> anyhow::Result<Self> {
+        let mut overrides = overrides.to_vec();
+        overrides.push(Override::new("train.scale", args.scale));
+        let Opened { rig, mut source, damage } = open::recording(path, None, &overrides)?;
+        let mut join = Join::new(&rig)?;
+        if let Some(list) = list {
+            join = join.taking_only(list);
+        }
+        let bar = print::bar(None, "{spinner} {pos} keyframes", quiet);
+        let mut keyframes: Vec<Arc<Keyframe>> = Vec::new();
+        let mut apply = |events: Vec<JoinEvent>| {
+            for event in events {
+                match event {
+                    JoinEvent::Accepted(keyframe) => keyframes.push(keyframe),
+                    JoinEvent::Evicted { camera, stamp } => {
+                        keyframes.retain(|keyframe| keyframe.camera != camera || keyframe.stamp != stamp);
+                    }
+                    JoinEvent::Seen(_) | JoinEvent::Refused { .. } => {}
+                }
+            }
+            bar.set_position(keyframes.len() as u64);
+        };
+        while let Some(sample) = source.next_sample()? {
+            apply(join.push(sample));
+        }
+        apply(join.finish());
+        bar.finish_and_clear();
+        log::info!("{}", join.counts());
+        let mut losses = Vec::new();
+        losses.extend(damage.get().cloned());
+        let names = keyframes.iter().map(|keyframe| name(keyframe)).collect();
+        let mut data = Self { keyframes, names, rig: Some(rig), losses };
+        if let Some(argument) = &args.holdout {
+            data.hold_out(&Holdout::from_argument(argument)?)?;
+        }
+        Ok(data)
+    }
+
+    /// Splits anew, each camera on its own.
+    fn hold_out(&mut self, holdout: &Holdout) -> anyhow::Result<()> {
+        let mut by_camera: BTreeMap<Arc<str>, Vec<usize>> = BTreeMap::new();
+        for (ix, keyframe) in self.keyframes.iter().enumerate() {
+            by_camera.entry(keyframe.camera.clone()).or_default().push(ix);
+        }
+        for ixs in by_camera.values() {
+            let names: Vec<&str> = ixs.iter().map(|ix| self.names[*ix].as_str()).collect();
+            for (ix, split) in ixs.iter().zip(holdout.splits(&names)?) {
+                Arc::make_mut(&mut self.keyframes[*ix]).split = split;
+            }
+        }
+        Ok(())
+    }
+
+    /// Keeps what a list names, as what it names it.
+    fn take_only(&mut self, list: &KeyframeList) {
+        let mut kept = Self {
+            keyframes: Vec::new(),
+            names: Vec::new(),
+            rig: self.rig.take(),
+            losses: std::mem::take(&mut self.losses),
+        };
+        for (mut keyframe, name) in std::mem::take(&mut self.keyframes).into_iter().zip(std::mem::take(&mut self.names))
+        {
+            if let Some(split) = list.split_of(&keyframe.camera, keyframe.stamp) {
+                Arc::make_mut(&mut keyframe).split = split;
+                kept.keyframes.push(keyframe);
+                kept.names.push(name);
+            }
+        }
+        if kept.keyframes.len() < list.len() {
+            kept.losses.push(format!(
+                "{} of {} listed keyframes are not in the data",
+                list.len() - kept.keyframes.len(),
+                list.len()
+            ));
+        }
+        *self = kept;
+    }
+}
+
+/// Name of a recorded image: camera and stamp.
+fn name(keyframe: &Keyframe) -> String {
+    format!("{}/{}", keyframe.camera, keyframe.stamp.0)
+}

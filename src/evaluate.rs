@@ -1,0 +1,231 @@
+//! How good a model is: every test keyframe drawn from its own pose at its own size, and scored.
+//!
+//! The one evaluation of the program: `train`, `run` and `eval` tell the same numbers for the same model.
+
+use anyhow::Context;
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::fmt::{Display, Formatter};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use trainer::eval::{Lpips, PixelPair, depth_rmse_m, psnr, ssim};
+use trainer::request::Shutter;
+use trainer::{Keyframe, Method, Picture, Projection, RenderRequest};
+
+/// Names the weights of LPIPS where no flag does.
+const LPIPS_WEIGHTS: &str = "FIELDRIG_LPIPS_WEIGHTS";
+/// Nothing nearer than this is drawn, metres.
+const NEAR_M: f64 = 0.01;
+/// Nothing further than this is drawn, metres.
+const FAR_M: f64 = 1000.0;
+
+/// Which scores are wanted.
+#[derive(Clone)]
+pub(crate) struct Evaluator {
+    /// Everything there is; else PSNR only.
+    all: bool,
+    /// Absent without weights.
+    lpips: Option<Arc<Lpips>>,
+}
+
+/// Scores of one test image. `None` is not known, never zero.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub(crate) struct ImageScores {
+    pub(crate) camera: String,
+    pub(crate) stamp_nanos: i64,
+    /// dB against the image as the camera delivered it.
+    pub(crate) psnr: f64,
+    pub(crate) ssim: Option<f64>,
+    pub(crate) lpips: Option<f64>,
+    /// Root mean square along z over pixels where both have depth, metres.
+    pub(crate) depth_rmse_m: Option<f64>,
+    /// dB against the noise-free image, drawn at the true pose; in simulation only.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) psnr_truth: Option<f64>,
+    /// dB of the delivered image against the noise-free one; in simulation only.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) psnr_ceiling: Option<f64>,
+}
+
+/// Means over the test images. `None` is not known, never zero.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub(crate) struct Scores {
+    pub(crate) psnr: Option<f64>,
+    pub(crate) ssim: Option<f64>,
+    pub(crate) lpips: Option<f64>,
+    pub(crate) depth_rmse_m: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) psnr_truth: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) psnr_ceiling: Option<f64>,
+    /// PSNR by camera, told when there are several.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub(crate) psnr_per_camera: BTreeMap<String, f64>,
+}
+
+impl Evaluator {
+    /// Scores with PSNR, SSIM, depth and, where the flag or `FIELDRIG_LPIPS_WEIGHTS` names weights, LPIPS.
+    pub(crate) fn thorough(lpips_weights: Option<&Path>) -> anyhow::Result<Self> {
+        let named = std::env::var_os(LPIPS_WEIGHTS).map(PathBuf::from);
+        let lpips = lpips_weights.or(named.as_deref()).map(Lpips::load).transpose()?;
+        Ok(Self { all: true, lpips: lpips.map(Arc::new) })
+    }
+
+    /// PSNR and no more: one render an image.
+    pub(crate) fn psnr_only() -> Self {
+        Self { all: false, lpips: None }
+    }
+
+    /// Scores one test keyframe.
+    pub(crate) fn score(&self, method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<ImageScores> {
+        let drawn = draw(method, keyframe)?;
+        let pair = PixelPair::new(keyframe.size_px, &drawn.rgba_srgb, &keyframe.rgba_srgb)?;
+        Ok(ImageScores {
+            camera: keyframe.camera.to_string(),
+            stamp_nanos: keyframe.stamp.0,
+            psnr: psnr(&pair)?,
+            ssim: self.all.then(|| ssim(&pair)).transpose()?,
+            lpips: self.lpips.as_ref().map(|lpips| lpips.distance(&pair)).transpose()?,
+            depth_rmse_m: if self.all { depth_error(method, keyframe)? } else { None },
+            psnr_truth: if self.all { truth_score(method, keyframe)? } else { None },
+            psnr_ceiling: keyframe.truth.as_ref().and_then(|truth| truth.psnr_ceiling),
+        })
+    }
+
+    /// Scores all test keyframes.
+    pub(crate) fn score_all(
+        &self,
+        method: &mut dyn Method,
+        tests: &[Arc<Keyframe>],
+    ) -> anyhow::Result<Vec<ImageScores>> {
+        tests
+            .iter()
+            .map(|keyframe| {
+                self.score(method, keyframe)
+                    .with_context(|| format!("test image of {:?} at {} ns", keyframe.camera, keyframe.stamp.0))
+            })
+            .collect()
+    }
+}
+
+impl Scores {
+    /// The means of `images`.
+    pub(crate) fn mean(images: &[ImageScores]) -> Self {
+        let mut psnr_per_camera = BTreeMap::new();
+        for image in images {
+            psnr_per_camera.entry(image.camera.clone()).or_insert_with(Vec::new).push(image.psnr);
+        }
+        if psnr_per_camera.len() < 2 {
+            psnr_per_camera.clear();
+        }
+        Self {
+            psnr: mean(images.iter().map(|image| Some(image.psnr))),
+            ssim: mean(images.iter().map(|image| image.ssim)),
+            lpips: mean(images.iter().map(|image| image.lpips)),
+            depth_rmse_m: mean(images.iter().map(|image| image.depth_rmse_m)),
+            psnr_truth: mean(images.iter().map(|image| image.psnr_truth)),
+            psnr_ceiling: mean(images.iter().map(|image| image.psnr_ceiling)),
+            psnr_per_camera: psnr_per_camera
+                .into_iter()
+                .filter_map(|(camera, values)| Some((camera, mean(values.into_iter().map(Some))?)))
+                .collect(),
+        }
+    }
+}
+
+impl Display for Scores {
+    fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
+        let decibels = |what: &str, value: Option<f64>| value.map(|value| format!("{what} {value:.2} dB"));
+        let mut words: Vec<String> = decibels("PSNR", self.psnr).into_iter().collect();
+        words.extend(self.psnr_per_camera.iter().filter_map(|(camera, psnr)| decibels(camera, Some(*psnr))));
+        words.extend(decibels("against truth", self.psnr_truth));
+        words.extend(decibels("ceiling", self.psnr_ceiling));
+        words.extend(self.ssim.map(|ssim| format!("SSIM {ssim:.4}")));
+        words.extend(self.lpips.map(|lpips| format!("LPIPS {lpips:.4}")));
+        words.extend(self.depth_rmse_m.map(|depth| format!("depth {:.1} mm", depth * 1e3)));
+        if words.is_empty() { f.write_str("no test image yet") } else { f.write_str(&words.join(", ")) }
+    }
+}
+
+/// Mean of what is known.
+fn mean(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
+    let (mut sum, mut n) = (0.0, 0.0);
+    for value in values.flatten() {
+        sum += value;
+        n += 1.0;
+    }
+    (n > 0.0).then(|| sum / n)
+}
+
+/// The picture a model shows where a keyframe was taken, sheared as the keyframe is.
+pub(crate) fn draw(method: &mut dyn Method, keyframe: &Keyframe) -> Result<Picture, trainer::Error> {
+    method.render(&request(keyframe))
+}
+
+fn request(keyframe: &Keyframe) -> RenderRequest {
+    RenderRequest {
+        world_from_camera: keyframe.world_from_camera,
+        size_px: keyframe.size_px,
+        projection: Projection::Pinhole { focal_px: keyframe.focal_px, principal_px: keyframe.principal_px },
+        shutter: keyframe.twist.map(|twist| Shutter { twist, readout_secs: keyframe.readout_secs }),
+        near_m: NEAR_M,
+        far_m: FAR_M,
+        crop: None,
+        background_srgb: [0.0; 3],
+    }
+}
+
+/// Depth has its own size, lens and pose, so it is drawn on its own.
+fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<Option<f64>> {
+    let Some(depth) = &keyframe.depth else { return Ok(None) };
+    let drawn = method.render(&RenderRequest {
+        world_from_camera: depth.world_from_camera,
+        size_px: depth.size_px,
+        projection: Projection::Pinhole { focal_px: depth.focal_px, principal_px: depth.principal_px },
+        shutter: None,
+        ..request(keyframe)
+    })?;
+    Ok(depth_rmse_m(&drawn.depth_m, &depth.depth_m)?)
+}
+
+/// The noise-free image has no shear, and is seen from the true pose.
+fn truth_score(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<Option<f64>> {
+    let Some(truth) = &keyframe.truth else { return Ok(None) };
+    let at_truth = RenderRequest { world_from_camera: truth.world_from_camera, shutter: None, ..request(keyframe) };
+    let drawn = method.render(&at_truth)?;
+    Ok(Some(psnr(&PixelPair::new(keyframe.size_px, &drawn.rgba_srgb, &truth.rgba_srgb)?)?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn image(camera: &str, psnr: f64, lpips: Option<f64>) -> ImageScores {
+        ImageScores {
+            camera: camera.into(),
+            stamp_nanos: 0,
+            psnr,
+            ssim: None,
+            lpips,
+            depth_rmse_m: None,
+            psnr_truth: None,
+            psnr_ceiling: None,
+        }
+    }
+
+    #[test]
+    fn means_leave_out_what_is_not_known() {
+        let scores = Scores::mean(&[image("wrist", 20.0, Some(0.5)), image("wrist", 30.0, None)]);
+        assert_eq!((scores.psnr, scores.lpips, scores.ssim), (Some(25.0), Some(0.5), None));
+        assert!(scores.psnr_per_camera.is_empty(), "one camera has no share to tell");
+        assert_eq!(Scores::mean(&[]), Scores::default());
+    }
+
+    #[test]
+    fn several_cameras_are_told_apart() {
+        let scores =
+            Scores::mean(&[image("wrist", 20.0, None), image("front", 30.0, None), image("wrist", 22.0, None)]);
+        assert_eq!(scores.psnr, Some(24.0));
+        assert_eq!(scores.psnr_per_camera, BTreeMap::from([("front".into(), 30.0), ("wrist".into(), 21.0)]));
+    }
+}

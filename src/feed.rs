@@ -1,0 +1,220 @@
+//! The input side of a run: source, recorder and join on a thread of their own, keyframes out of a bounded queue.
+
+use crate::join::{Join, JoinEvent, Seen};
+use crate::stop::Stop;
+use anyhow::{Context, anyhow};
+use drivers::recording::Recorder;
+use drivers::{PixelFormat, Sample, Source};
+use kinematics::Stamp;
+use std::collections::{BTreeMap, HashMap};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+use trainer::Keyframe;
+use viz::{Hub, LiveImage, LivePixels};
+
+/// Keyframes that may wait for the trainer. When they do, the source waits too, and live devices drop (and count) images.
+const MAX_WAITING: usize = 8;
+
+/// A change of the set of keyframes.
+#[derive(Debug)]
+pub(crate) enum Change {
+    /// A new keyframe.
+    Accepted(Arc<Keyframe>),
+    /// A keyframe made room for others.
+    Evicted {
+        /// Name of its camera.
+        camera: Arc<str>,
+        /// Its stamp.
+        stamp: Stamp,
+    },
+}
+
+/// What the run can see of the input while it runs.
+#[derive(Debug, Default)]
+struct Shared {
+    first_image: OnceLock<Instant>,
+    refused: Mutex<BTreeMap<String, u64>>,
+    broke_off: AtomicBool,
+}
+
+/// What goes in.
+pub(crate) struct Input {
+    pub(crate) source: Box<dyn Source>,
+    pub(crate) join: Join,
+    pub(crate) recorder: Option<Recorder>,
+    /// Focal length and principal point of every camera, pixels.
+    pub(crate) lenses: HashMap<Arc<str>, ([f64; 2], [f64; 2])>,
+}
+
+/// What is left when the input ended.
+pub(crate) struct Leftover {
+    pub(crate) join: Join,
+    /// Why the input broke off, if it did.
+    pub(crate) input_error: Option<drivers::Error>,
+    /// Why the recording broke off, if it did.
+    pub(crate) recording_error: Option<drivers::Error>,
+}
+
+/// The running input.
+pub(crate) struct Feed {
+    changes: Receiver<Change>,
+    shared: Arc<Shared>,
+    thread: JoinHandle<Leftover>,
+    ended: bool,
+}
+
+impl Feed {
+    /// Starts to read `input`; ends at its end, at `stop`, or at an error of the source.
+    pub(crate) fn start(input: Input, hub: Hub, stop: Stop) -> anyhow::Result<Self> {
+        let (sender, changes) = sync_channel(MAX_WAITING);
+        let shared = Arc::new(Shared::default());
+        let pump = Pump { input, hub, stop, sender, shared: shared.clone() };
+        let thread =
+            std::thread::Builder::new().name("input".into()).spawn(|| pump.run()).context("cannot start a thread")?;
+        Ok(Self { changes, shared, thread, ended: false })
+    }
+
+    /// When the first image came.
+    pub(crate) fn first_image(&self) -> Option<Instant> {
+        self.shared.first_image.get().copied()
+    }
+
+    /// Images refused so far, by reason.
+    pub(crate) fn refused(&self) -> BTreeMap<String, u64> {
+        lock(&self.shared.refused).clone()
+    }
+
+    /// The next change, waiting for at most `timeout`; `None` when there is none yet or none will come any more.
+    pub(crate) fn next(&mut self, timeout: Duration) -> Option<Change> {
+        match self.changes.recv_timeout(timeout) {
+            Ok(change) => Some(change),
+            Err(RecvTimeoutError::Timeout) => None,
+            Err(RecvTimeoutError::Disconnected) => {
+                self.ended = true;
+                None
+            }
+        }
+    }
+
+    /// Whether the input ended and all its changes were taken.
+    pub(crate) fn ended(&self) -> bool {
+        self.ended
+    }
+
+    /// Whether the source failed.
+    pub(crate) fn broke_off(&self) -> bool {
+        self.shared.broke_off.load(Ordering::Relaxed)
+    }
+
+    /// Ends the input and waits for its thread, which closes the recording.
+    pub(crate) fn finish(self) -> anyhow::Result<Leftover> {
+        // A pump that waits to send is woken by this.
+        drop(self.changes);
+        self.thread.join().map_err(|_| anyhow!("the input thread panicked: this is a bug"))
+    }
+}
+
+struct Pump {
+    input: Input,
+    hub: Hub,
+    stop: Stop,
+    sender: SyncSender<Change>,
+    shared: Arc<Shared>,
+}
+
+/// The trainer takes no more.
+struct Hangup;
+
+impl Pump {
+    fn run(mut self) -> Leftover {
+        let mut recording_error = None;
+        let mut input_error = None;
+        while !self.stop.asked() {
+            let sample = match self.input.source.next_sample() {
+                Ok(Some(sample)) => sample,
+                Ok(None) => break,
+                Err(error) => {
+                    self.shared.broke_off.store(true, Ordering::Relaxed);
+                    input_error = Some(error);
+                    break;
+                }
+            };
+            if let (Some(recorder), None) = (&mut self.input.recorder, &recording_error)
+                && let Err(error) = recorder.write(&sample)
+            {
+                log::error!("the recording ends here, the run goes on: {error}");
+                recording_error = Some(error);
+            }
+            if matches!(sample, Sample::Image(_)) {
+                self.shared.first_image.get_or_init(Instant::now);
+            }
+            let events = self.input.join.push(sample);
+            if self.forward(events).is_err() {
+                break;
+            }
+        }
+        let events = self.input.join.finish();
+        // A trainer that hung up needs no more keyframes.
+        let _ = self.forward(events);
+        if let (Some(recorder), None) = (self.input.recorder.take(), &recording_error)
+            && let Err(error) = recorder.finish()
+        {
+            recording_error = Some(error);
+        }
+        Leftover { join: self.input.join, input_error, recording_error }
+    }
+
+    fn forward(&self, events: Vec<JoinEvent>) -> Result<(), Hangup> {
+        for event in events {
+            match event {
+                JoinEvent::Accepted(keyframe) => self.send(Change::Accepted(keyframe))?,
+                JoinEvent::Evicted { camera, stamp } => self.send(Change::Evicted { camera, stamp })?,
+                JoinEvent::Seen(seen) => self.show(&seen),
+                JoinEvent::Refused { why, .. } => {
+                    *lock(&self.shared.refused).entry(why.name().to_owned()).or_default() += 1;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn send(&self, change: Change) -> Result<(), Hangup> {
+        self.sender.send(change).map_err(|_| Hangup)
+    }
+
+    /// Shows what a camera sees to whoever looks.
+    fn show(&self, seen: &Seen) {
+        if self.hub.n_clients() == 0 {
+            return;
+        }
+        let image = &seen.image;
+        let pixels = match image.format {
+            PixelFormat::Rgb8 => LivePixels::Rgb(image.data.clone()),
+            PixelFormat::Jpeg => LivePixels::Jpeg(image.data.clone()),
+            PixelFormat::Gray8 | PixelFormat::Png => match image.decode_rgb() {
+                Ok(rgb) => LivePixels::Rgb(rgb.into()),
+                // The join counts images that do not decode.
+                Err(_) => return,
+            },
+            PixelFormat::DepthU16 { .. } => return,
+        };
+        let Some(&(focal_px, principal_px)) = self.input.lenses.get(&image.camera) else { return };
+        self.hub.set_live_image(LiveImage {
+            camera: image.camera.clone(),
+            stamp: image.stamp,
+            size_px: image.size_px,
+            pixels,
+            world_from_camera: Some(seen.world_from_camera),
+            focal_px,
+            principal_px,
+        });
+    }
+}
+
+/// Locks, also after a panic elsewhere: a count cannot be half written.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

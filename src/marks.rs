@@ -1,0 +1,50 @@
+//! The seconds at which scores are told: 0.25, 0.5, 1, 2, 4, 8, 16, 32, 60, 120, 240 and so on.
+
+/// The next mark, and those after it.
+#[derive(Clone, Debug)]
+pub(crate) struct Marks {
+    next_secs: f64,
+}
+
+impl Default for Marks {
+    fn default() -> Self {
+        Self { next_secs: 0.25 }
+    }
+}
+
+impl Marks {
+    /// Whether a mark was reached at `secs`; several passed at once count as one.
+    pub(crate) fn reached(&mut self, secs: f64) -> bool {
+        let mut reached = false;
+        while secs >= self.next_secs {
+            self.next_secs = after(self.next_secs);
+            reached = true;
+        }
+        reached
+    }
+}
+
+/// Doubles, and turns from seconds to whole minutes between 32 s and 60 s.
+fn after(mark_secs: f64) -> f64 {
+    if mark_secs == 32.0 { 60.0 } else { 2.0 * mark_secs }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_mark_comes_once() {
+        let mut marks = Marks::default();
+        let reached: Vec<f64> = (0..=4000).map(|n| f64::from(n) * 0.125).filter(|secs| marks.reached(*secs)).collect();
+        assert_eq!(reached, [0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 120.0, 240.0, 480.0]);
+    }
+
+    #[test]
+    fn marks_slept_through_count_once() {
+        let mut marks = Marks::default();
+        assert!(marks.reached(50.0));
+        assert!(!marks.reached(59.0));
+        assert!(marks.reached(60.0));
+    }
+}

@@ -1,0 +1,61 @@
+//! Which scene model: by its name on the command line, new or out of a folder.
+
+use crate::config::{Rig, Train};
+use crate::exit::BadArgument;
+use anyhow::Context;
+use std::path::Path;
+use std::sync::Arc;
+use trainer::Method;
+use trainer::gpu::Gpu;
+use trainer::splat::{SplatOptions, SplatTrainer};
+
+/// The scene models there are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub(crate) enum Kind {
+    /// 3D Gaussians.
+    Splat,
+}
+
+impl Kind {
+    /// The kind that a rig file names.
+    pub(crate) fn of_rig(rig: &Rig) -> Result<Self, BadArgument> {
+        let name = &rig.train.method;
+        clap::ValueEnum::from_str(name, false)
+            .map_err(|_| BadArgument(format!("train.method = {name:?}: must be \"splat\"")))
+    }
+
+    /// Its name in files and on the command line.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Splat => "splat",
+        }
+    }
+
+    /// A model that has seen nothing yet.
+    pub(crate) fn start(self, gpu: Arc<Gpu>, options: SplatOptions) -> anyhow::Result<Box<dyn Method>> {
+        match self {
+            Self::Splat => Ok(Box::new(SplatTrainer::new(gpu, options)?)),
+        }
+    }
+}
+
+/// A saved model.
+pub(crate) fn load(gpu: Arc<Gpu>, folder: &Path) -> anyhow::Result<Box<dyn Method>> {
+    let model = SplatTrainer::load(gpu, folder).with_context(|| format!("no model in {}", folder.display()))?;
+    Ok(Box::new(model))
+}
+
+/// The options of a rig file as the trainer wants them; `steps` when their number is settled beforehand.
+pub(crate) fn options(train: &Train, steps: Option<u64>) -> Result<SplatOptions, BadArgument> {
+    let usual = SplatOptions::default();
+    let max_splats = train.max_splats.unwrap_or(usual.max_splats.into());
+    Ok(SplatOptions {
+        seed: train.seed,
+        max_splats: u32::try_from(max_splats)
+            .map_err(|_| BadArgument(format!("max_splats = {max_splats}: must be at most {}", u32::MAX)))?,
+        max_bytes: train.max_bytes,
+        sh_degree: train.sh_degree,
+        n_planned_steps: steps.unwrap_or(usual.n_planned_steps),
+        ..usual
+    })
+}

@@ -1,0 +1,118 @@
+//! Where the results of a run go, and what its report says.
+
+use anyhow::{Context, ensure};
+use serde::Serialize;
+use sha2::{Digest, Sha256};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use trainer::Keyframe;
+
+/// The files of a saved model: what `checkpoint_sha256` covers, in this order.
+const MODEL_FILES: [&str; 2] = ["model.json", "splats.ply"];
+const SECS_PER_DAY: u64 = 86_400;
+
+/// Makes the folder asked for, or `runs/<UTC time>`.
+pub(crate) fn make(asked: Option<&Path>) -> anyhow::Result<PathBuf> {
+    if let Some(folder) = asked {
+        std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
+        return Ok(folder.to_owned());
+    }
+    #[expect(clippy::disallowed_methods, reason = "a name for people; nothing is measured by it")]
+    let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    std::fs::create_dir_all("runs").context("cannot make the folder runs")?;
+    let name = name_from_time(since_epoch);
+    for attempt in 1..100 {
+        let folder = match attempt {
+            1 => PathBuf::from(format!("runs/{name}")),
+            _ => PathBuf::from(format!("runs/{name}-{attempt}")),
+        };
+        match std::fs::create_dir(&folder) {
+            Ok(()) => return Ok(folder),
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
+            Err(error) => return Err(error).with_context(|| format!("cannot make the folder {}", folder.display())),
+        }
+    }
+    anyhow::bail!("runs/{name} and ninety-eight more exist already: name a folder with --out")
+}
+
+/// Writes a report as readable JSON.
+pub(crate) fn write_json(path: &Path, report: &impl Serialize) -> anyhow::Result<()> {
+    let mut text = serde_json::to_string_pretty(report).context("cannot write the report as JSON")?;
+    text.push('\n');
+    std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
+}
+
+/// Writes which keyframes were used, and what for, for `--keyframes`.
+pub(crate) fn write_keyframe_list(path: &Path, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
+    std::fs::write(path, crate::join::keyframe_list(keyframes.iter()))
+        .with_context(|| format!("cannot write {}", path.display()))
+}
+
+/// SHA-256 over the model files of a folder, each preceded by its name and length.
+pub(crate) fn checkpoint_sha256(folder: &Path) -> anyhow::Result<String> {
+    let mut hash = Sha256::new();
+    let mut n_files = 0;
+    for name in MODEL_FILES {
+        let path = folder.join(name);
+        if !path.exists() {
+            continue;
+        }
+        let bytes = std::fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
+        hash.update(format!("{name} {}\n", bytes.len()));
+        hash.update(&bytes);
+        n_files += 1;
+    }
+    ensure!(n_files > 0, "{} holds no model", folder.display());
+    Ok(hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
+}
+
+/// `20261121-093000` for a time since 1970, UTC.
+fn name_from_time(since_epoch: Duration) -> String {
+    let secs = since_epoch.as_secs();
+    let (year, month, day) = date_from_days(secs / SECS_PER_DAY);
+    let of_day = secs % SECS_PER_DAY;
+    format!("{year:04}{month:02}{day:02}-{:02}{:02}{:02}", of_day / 3600, of_day / 60 % 60, of_day % 60)
+}
+
+/// Year, month and day of a day counted from 1 January 1970.
+fn date_from_days(mut days: u64) -> (u64, usize, u64) {
+    let is_leap = |year: u64| year % 4 == 0 && (year % 100 != 0 || year % 400 == 0);
+    let mut year = 1970;
+    while days >= 365 + u64::from(is_leap(year)) {
+        days -= 365 + u64::from(is_leap(year));
+        year += 1;
+    }
+    let lengths = [31, 28 + u64::from(is_leap(year)), 31, 30, 31, 30, 31, 31, 30, 31, 30, 31];
+    let mut month_ix = 0;
+    while days >= lengths[month_ix] {
+        days -= lengths[month_ix];
+        month_ix += 1;
+    }
+    (year, month_ix + 1, days + 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn folders_are_named_by_utc() {
+        assert_eq!(name_from_time(Duration::ZERO), "19700101-000000");
+        assert_eq!(name_from_time(Duration::from_secs(951_782_400)), "20000229-000000");
+        assert_eq!(name_from_time(Duration::from_secs(1_795_253_400)), "20261121-093000");
+        assert_eq!(name_from_time(Duration::from_secs(4_102_444_799)), "20991231-235959");
+    }
+
+    #[test]
+    fn the_checksum_sees_every_byte_and_every_name() {
+        let folder = tempfile::tempdir().expect("folder");
+        assert!(checkpoint_sha256(folder.path()).is_err(), "no model, no checksum");
+        std::fs::write(folder.path().join("splats.ply"), b"abc").expect("file");
+        let first = checkpoint_sha256(folder.path()).expect("a model");
+        std::fs::write(folder.path().join("report.json"), b"other").expect("file");
+        assert_eq!(checkpoint_sha256(folder.path()).expect("a model"), first);
+        std::fs::write(folder.path().join("splats.ply"), b"abd").expect("file");
+        assert_ne!(checkpoint_sha256(folder.path()).expect("a model"), first);
+    }
+}

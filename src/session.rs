@@ -1,0 +1,303 @@
+//! One model in training: its test keyframes, its clock, and what is told of it.
+
+use crate::evaluate::{Evaluator, ImageScores, Scores};
+use crate::marks::Marks;
+use crate::{print, run_folder};
+use indicatif::ProgressBar;
+use serde::Serialize;
+use std::collections::{BTreeMap, VecDeque};
+use std::path::Path;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use trainer::gpu::Gpu;
+use trainer::{Keyframe, Method, Progress, Split};
+
+/// Points of the PSNR curve that are kept; past them every second one goes.
+const MAX_HISTORY: usize = 512;
+
+/// When to stop.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Limits {
+    /// Seconds on the session's clock.
+    pub(crate) seconds: Option<f64>,
+    /// Optimiser updates.
+    pub(crate) steps: Option<u64>,
+}
+
+/// How a session is judged.
+pub(crate) struct Evaluators {
+    /// At the marks: thorough where nobody waits, quick in a live run.
+    pub(crate) at_marks: Evaluator,
+    /// At the end.
+    pub(crate) at_end: Evaluator,
+}
+
+/// A model in training.
+pub(crate) struct Session {
+    pub(crate) method: Box<dyn Method>,
+    gpu: Arc<Gpu>,
+    /// At the marks.
+    evaluator: Evaluator,
+    /// At the end.
+    last_evaluator: Evaluator,
+    tests: VecDeque<Arc<Keyframe>>,
+    limits: Limits,
+    clock: Clock,
+    marks: Marks,
+    told: Vec<Eval>,
+    history: Vec<(f64, f64)>,
+    /// Newest PSNR of each test keyframe, by camera and stamp.
+    newest_psnr: BTreeMap<(String, i64), f64>,
+    json: bool,
+    bar: ProgressBar,
+}
+
+/// Seconds of training; evaluation does not count.
+#[derive(Clone, Copy, Debug, Default)]
+struct Clock {
+    started: Option<Instant>,
+    excluded: Duration,
+}
+
+impl Clock {
+    fn secs(&self) -> f64 {
+        self.started.map_or(0.0, |started| started.elapsed().saturating_sub(self.excluded).as_secs_f64())
+    }
+}
+
+/// What is told at a mark.
+#[derive(Clone, Debug, Serialize)]
+struct Eval {
+    event: &'static str,
+    seconds: f64,
+    step: u64,
+    #[serde(flatten)]
+    scores: Scores,
+    primitives: u64,
+    bytes: u64,
+    step_millis: Option<f64>,
+}
+
+/// What is told at the end.
+#[derive(Clone, Debug, Serialize)]
+struct Done<'a> {
+    event: &'static str,
+    seconds: f64,
+    steps: u64,
+    #[serde(flatten)]
+    scores: Scores,
+    primitives: u64,
+    bytes: u64,
+    out: &'a Path,
+    checkpoint_sha256: &'a str,
+}
+
+/// What `report.json` holds.
+#[derive(Debug, Serialize)]
+struct Report<'a, T: Serialize> {
+    done: &'a Done<'a>,
+    adapter: String,
+    #[serde(flatten)]
+    particulars: &'a T,
+    marks: &'a [Eval],
+    per_image: &'a [ImageScores],
+}
+
+impl Session {
+    /// A session around a fresh model; its clock stands still until [`Self::start_clock`].
+    pub(crate) fn new(
+        gpu: Arc<Gpu>,
+        method: Box<dyn Method>,
+        evaluators: Evaluators,
+        limits: Limits,
+        json: bool,
+    ) -> Self {
+        let length = limits.steps.or(limits.seconds.map(|secs| secs.ceil().max(0.0) as u64));
+        let template = if length.is_some() { "{bar:30} {elapsed} {msg}" } else { "{spinner} {elapsed} {msg}" };
+        Self {
+            method,
+            gpu,
+            evaluator: evaluators.at_marks,
+            last_evaluator: evaluators.at_end,
+            tests: VecDeque::new(),
+            limits,
+            clock: Clock::default(),
+            marks: Marks::default(),
+            told: Vec::new(),
+            history: Vec::new(),
+            newest_psnr: BTreeMap::new(),
+            json,
+            bar: print::bar(length, template, json),
+        }
+    }
+
+    /// Starts the clock, unless it runs.
+    pub(crate) fn start_clock(&mut self, at: Instant) {
+        self.clock.started.get_or_insert(at);
+    }
+
+    /// Seconds of training so far.
+    pub(crate) fn secs(&self) -> f64 {
+        self.clock.secs()
+    }
+
+    /// Gives a keyframe to the model; test keyframes are kept for evaluation too.
+    pub(crate) fn push(&mut self, keyframe: &Arc<Keyframe>) -> anyhow::Result<()> {
+        if keyframe.split == Split::Test {
+            self.tests.push_back(keyframe.clone());
+        }
+        Ok(self.method.push(keyframe.clone())?)
+    }
+
+    /// Takes a keyframe back.
+    pub(crate) fn remove(&mut self, camera: &str, stamp: kinematics::Stamp) -> anyhow::Result<()> {
+        self.tests.retain(|test| test.camera.as_ref() != camera || test.stamp != stamp);
+        self.newest_psnr.retain(|(of, nanos), _| of != camera || *nanos != stamp.0);
+        Ok(self.method.remove(camera, stamp)?)
+    }
+
+    /// Whether a limit was reached.
+    pub(crate) fn is_over(&self) -> bool {
+        self.limits.seconds.is_some_and(|secs| self.secs() >= secs)
+            || self.limits.steps.is_some_and(|steps| self.method.progress().step >= steps)
+    }
+
+    /// Trains a slice of at most `n_most` steps, and evaluates when a mark was reached.
+    pub(crate) fn step(&mut self, n_most: u64) -> anyhow::Result<u64> {
+        let left = self.limits.steps.map_or(u64::MAX, |steps| steps.saturating_sub(self.method.progress().step));
+        let n = self.method.step(n_most.min(left))?;
+        if self.marks.reached(self.secs()) {
+            self.tell_mark()?;
+        }
+        self.show();
+        Ok(n)
+    }
+
+    /// Evaluates the test keyframe whose score is oldest, for a curve between the marks; counts as training time.
+    pub(crate) fn refresh_psnr(&mut self) -> anyhow::Result<()> {
+        let Some(oldest) = self.tests.pop_front() else { return Ok(()) };
+        self.tests.push_back(oldest.clone());
+        let quick = Evaluator::psnr_only();
+        let scores = quick.score(self.method.as_mut(), &oldest)?;
+        self.newest_psnr.insert((scores.camera, scores.stamp_nanos), scores.psnr);
+        self.note_psnr();
+        Ok(())
+    }
+
+    /// Mean over the test keyframes of their newest PSNR, dB.
+    pub(crate) fn psnr(&self) -> Option<f64> {
+        let n = self.newest_psnr.len();
+        (n > 0).then(|| self.newest_psnr.values().sum::<f64>() / n as f64)
+    }
+
+    /// The curve of [`Self::psnr`] over seconds.
+    pub(crate) fn psnr_history(&self) -> &[(f64, f64)] {
+        &self.history
+    }
+
+    /// Where training stands.
+    pub(crate) fn progress(&self) -> Progress {
+        self.method.progress()
+    }
+
+    /// Saves the model, scores it a last time, writes the report, and tells the end.
+    ///
+    /// `particulars` are what only this kind of run knows.
+    pub(crate) fn finish(mut self, out: &Path, particulars: &impl Serialize) -> anyhow::Result<()> {
+        self.gpu.wait()?;
+        let seconds = self.secs();
+        self.bar.finish_and_clear();
+        // Saved before it is scored: a second Ctrl-C during the scoring loses nothing.
+        self.method.save(out)?;
+        let checkpoint_sha256 = run_folder::checkpoint_sha256(out)?;
+        std::mem::swap(&mut self.evaluator, &mut self.last_evaluator);
+        let per_image = self.score_all()?;
+        let progress = self.method.progress();
+        let done = Done {
+            event: "done",
+            seconds,
+            steps: progress.step,
+            scores: Scores::mean(&per_image),
+            primitives: progress.primitives,
+            bytes: progress.bytes,
+            out,
+            checkpoint_sha256: &checkpoint_sha256,
+        };
+        let report =
+            Report { done: &done, adapter: self.gpu.describe(), particulars, marks: &self.told, per_image: &per_image };
+        run_folder::write_json(&out.join("report.json"), &report)?;
+        if self.json {
+            return print::json(&done);
+        }
+        print::line(format_args!(
+            "{seconds:.1} s, {} steps, {} splats, {:.1} MB: {}",
+            done.steps,
+            done.primitives,
+            done.bytes as f64 / 1e6,
+            done.scores
+        ))?;
+        Ok(print::line(format_args!("saved in {}", out.display()))?)
+    }
+
+    /// Scores every test keyframe off the clock.
+    fn score_all(&mut self) -> anyhow::Result<Vec<ImageScores>> {
+        self.gpu.wait()?;
+        let before = Instant::now();
+        let tests = self.tests.make_contiguous();
+        let images = self.evaluator.score_all(self.method.as_mut(), tests)?;
+        self.gpu.wait()?;
+        self.clock.excluded += before.elapsed();
+        Ok(images)
+    }
+
+    fn tell_mark(&mut self) -> anyhow::Result<()> {
+        // What was queued up to here belongs to the mark.
+        self.gpu.wait()?;
+        let seconds = self.secs();
+        let images = self.score_all()?;
+        for image in &images {
+            self.newest_psnr.insert((image.camera.clone(), image.stamp_nanos), image.psnr);
+        }
+        self.note_psnr();
+        let progress = self.method.progress();
+        let eval = Eval {
+            event: "eval",
+            seconds,
+            step: progress.step,
+            scores: Scores::mean(&images),
+            primitives: progress.primitives,
+            bytes: progress.bytes,
+            step_millis: (progress.step > 0).then_some(progress.step_millis),
+        };
+        if self.json {
+            print::json(&eval)?;
+        } else {
+            print::line(format_args!(
+                "{seconds:7.2} s  step {:6}  {:8} splats  {:7.2} ms a step  {}",
+                eval.step, eval.primitives, progress.step_millis, eval.scores
+            ))?;
+        }
+        self.told.push(eval);
+        Ok(())
+    }
+
+    fn note_psnr(&mut self) {
+        let Some(psnr) = self.psnr() else { return };
+        self.history.push((self.secs(), psnr));
+        if self.history.len() > MAX_HISTORY {
+            let mut keep = false;
+            self.history.retain(|_| {
+                keep = !keep;
+                keep
+            });
+        }
+    }
+
+    fn show(&self) {
+        let progress = self.method.progress();
+        let position = if self.limits.steps.is_some() { progress.step } else { self.secs() as u64 };
+        self.bar.set_position(position);
+        let psnr = self.psnr().map_or(String::new(), |psnr| format!(", {psnr:.2} dB"));
+        self.bar.set_message(format!("step {}, {} splats{psnr}", progress.step, progress.primitives));
+    }
+}
