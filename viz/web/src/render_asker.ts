@@ -1,6 +1,6 @@
 // Decides which picture to ask for and when.
 //
-// While the view moves: one small picture at a time, as large as comes back quickly. When it rests: all stages.
+// While the view moves: one small picture at a time, as large as comes back quickly. When it rests: the finer stages.
 // While the model learns: the full picture again from time to time.
 
 import type { Connection } from "./connection";
@@ -32,6 +32,8 @@ export class RenderAsker {
   private lastMillis = 0;
   private movedAt = -Infinity;
   private movingIx = 0;
+  /** Scale of the newest picture of the moving view; what comes after it is not coarser. */
+  private movingScale = 0;
   private isWaiting = false;
   private isRested = false;
   private hasNews = false;
@@ -69,7 +71,10 @@ export class RenderAsker {
     this.isWaiting = false;
     this.finishedAt = performance.now();
     this.lastMillis = millis;
-    if (header.scale < 1 && header.n_stages === 1) this.adapt(millis);
+    if (!this.isRested) {
+      this.movingScale = header.scale;
+      this.adapt(millis);
+    }
     return millis;
   }
 
@@ -86,7 +91,9 @@ export class RenderAsker {
     if (now - this.askedAt > patience) this.isWaiting = false;
     if (!this.isRested && now - this.movedAt > REST_MILLIS) {
       this.isRested = true;
-      this.ask(this.stages()); // Replaces whatever is on its way.
+      const finer = this.stages().filter((scale) => scale > this.movingScale);
+      this.movingScale = 0;
+      this.ask(finer.length > 0 ? finer : [1]); // Replaces whatever is on its way.
     } else if (!this.isRested && !this.isWaiting) {
       this.ask([MOVING_SCALES[this.movingIx]!]);
     } else if (this.isRested && !this.isWaiting && this.hasNews) {
