@@ -62,13 +62,14 @@ impl Acceptance {
             return if self.readout_secs > 0.0 { Err(Refusal::ShearUnknown) } else { Ok(()) };
         };
         let speed_px_s = motion::image_speed_px_s(twist, pinhole, depth_m);
-        // Written so that a speed that is no number is refused.
         let blur_px = speed_px_s * exposure_secs.unwrap_or(0.0);
-        if !(blur_px <= self.config.max_blur_px) {
-            return Err(Refusal::Blur);
-        }
         let shear_px = speed_px_s * self.readout_secs;
-        if shear_px <= self.config.max_shear_px { Ok(()) } else { Err(Refusal::Shear) }
+        // Accepting what is small, not refusing what is large, also refuses a speed that is no number.
+        match (blur_px <= self.config.max_blur_px, shear_px <= self.config.max_shear_px) {
+            (true, true) => Ok(()),
+            (false, _) => Err(Refusal::Blur),
+            (true, false) => Err(Refusal::Shear),
+        }
     }
 
     /// Well exposed and sharp? `rgb` is `[height, width, 3]`.
@@ -86,5 +87,32 @@ impl Acceptance {
     pub(super) fn accept(&mut self, stamp: Stamp, pose: &Transform) {
         self.accepted.push(*pose);
         self.last = Some(stamp);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Override, Rig};
+    use kinematics::Twist;
+    use std::path::Path;
+
+    #[test]
+    fn a_velocity_that_is_not_known_counts_only_where_the_shutter_rolls() {
+        for (readout_micros, expected) in [(0, Ok(())), (15_000, Err(Refusal::ShearUnknown))] {
+            let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
+            let rig = Rig::load(&path, &[Override::new("camera.wrist.readout_micros", readout_micros)]).expect("a rig");
+            let camera = &rig.cameras[0];
+            let acceptance = Acceptance::new(&rig.join, camera, Spacing { translation_m: 1.0, rotation_rad: 1.0 });
+            let judge = |twist| {
+                let posed = Posed { world_from_camera: Transform::identity(), twist };
+                acceptance.judge_speed(&posed, &camera.intrinsics, Some(0.01), 0.5)
+            };
+            assert_eq!(judge(None), expected);
+            assert_eq!(judge(Some(Twist::zero())), Ok(()));
+            let mut broken = Twist::zero();
+            broken.linear_m_s.x = f64::NAN;
+            assert_eq!(judge(Some(broken)), Err(Refusal::Blur));
+        }
     }
 }

@@ -1,1 +1,415 @@
-//! Samples in, keyframes out.
+//! Generated samples in, keyframes out: poses at the shutter time, every refusal, the bounds, and replay bit for bit.
+
+use super::{Join, JoinEvent, KeyframeList, Refusal};
+use crate::config::{Override, Rig};
+use crate::open;
+use drivers::{Image, PixelFormat, Sample, TruthImage};
+use kinematics::{Chain, JointState, Stamp, Transform};
+use std::f64::consts::TAU;
+use std::path::Path;
+use std::sync::Arc;
+use toml::Value;
+use trainer::{Keyframe, Split};
+
+const SIZE_PX: [u32; 2] = [64, 48];
+const CENTER_RAD: [f64; 7] = [0.1, -0.3, 0.2, -2.0, 0.1, 1.8, 0.6];
+
+/// The static arm with a small camera of 10 Hz.
+fn rig(overrides: &[Override]) -> Rig {
+    let size = |key| Override::new(key, Value::from(SIZE_PX.map(i64::from).to_vec()));
+    let pair = |key, x, y| Override::new(key, Value::from(vec![x, y]));
+    let mut all = vec![
+        size("camera.wrist.size_px"),
+        pair("camera.wrist.intrinsics.focal_px", 61.0, 61.5),
+        pair("camera.wrist.intrinsics.principal_px", 32.0, 24.0),
+        Override::new("camera.wrist.rate_hz", 10),
+        Override::new("sim.truth", false),
+    ];
+    all.extend(overrides.iter().cloned());
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
+    Rig::load(&path, &all).expect("a rig file that comes along")
+}
+
+fn joints_rad(secs: f64) -> Vec<f64> {
+    CENTER_RAD
+        .iter()
+        .zip(1..)
+        .map(|(center, joint)| center + 0.15 * (TAU * secs / 8.0 + f64::from(joint)).sin())
+        .collect()
+}
+
+fn reading(nanos: i64) -> Sample {
+    let secs = Stamp(nanos).secs();
+    let speed = |joint: i32| 0.15 * TAU / 8.0 * (TAU * secs / 8.0 + f64::from(joint)).cos();
+    Sample::Joints(JointState {
+        stamp: Stamp(nanos),
+        position: joints_rad(secs),
+        velocity: (1..8).map(speed).collect(),
+        effort: vec![],
+    })
+}
+
+/// A chequered picture, different for every stamp.
+fn color(camera: &str, nanos: i64) -> Image {
+    let shift = nanos / 7_000_003;
+    let level = |x: i64, y: i64| if ((x + shift) / 3 + (y + shift) / 4) % 2 == 0 { 60 } else { 190 };
+    let [width, height] = SIZE_PX.map(i64::from);
+    let data: Vec<u8> =
+        (0..height).flat_map(|y| (0..width).flat_map(move |x| [level(x, y), 90, level(x, y)])).collect();
+    Image {
+        camera: camera.into(),
+        stamp: Stamp(nanos),
+        size_px: SIZE_PX,
+        format: PixelFormat::Rgb8,
+        data: data.into(),
+        exposure_secs: Some(1e-4),
+        n_skipped: 0,
+    }
+}
+
+/// Depth of 1 m, with one reading beyond the sensor's range and one hole.
+fn depth(nanos: i64) -> Image {
+    let mut data = 10_000_u16.to_le_bytes().repeat((SIZE_PX[0] * SIZE_PX[1]) as usize);
+    data[0..2].copy_from_slice(&65_000_u16.to_le_bytes());
+    data[2..4].fill(0);
+    Image { format: PixelFormat::DepthU16 { metres_per_count: 1e-4 }, data: data.into(), ..color("wrist", nanos) }
+}
+
+fn truth(nanos: i64) -> Sample {
+    let image = Image { data: vec![99; (SIZE_PX[0] * SIZE_PX[1] * 3) as usize].into(), ..color("wrist", nanos) };
+    let world_from_camera = Transform::translation(0.0, 0.0, Stamp(nanos).secs());
+    Sample::Truth(TruthImage { image, depth_m: Arc::from([]), world_from_camera, psnr_ceiling: Some(42.0) })
+}
+
+/// Joints at 200 Hz; colour at 10 Hz off their beat, depth 5 ms after it; each image after the readings that surround it.
+fn samples(secs: i64) -> Vec<Sample> {
+    let mut samples = Vec::new();
+    for tick in 0..secs * 200 {
+        samples.push(reading(tick * 5_000_000));
+        if tick % 20 == 10 {
+            let nanos = tick * 5_000_000 - 23_456_789;
+            samples.extend([
+                Sample::Image(color("wrist", nanos)),
+                truth(nanos),
+                Sample::Image(depth(nanos + 5_000_000)),
+            ]);
+        }
+    }
+    samples
+}
+
+#[derive(Default)]
+struct Outcome {
+    keyframes: Vec<Arc<Keyframe>>,
+    refused: Vec<(i64, Refusal)>,
+    evicted: Vec<i64>,
+    n_seen: usize,
+}
+
+fn play(join: &mut Join, samples: impl IntoIterator<Item = Sample>) -> Outcome {
+    let mut outcome = Outcome::default();
+    let mut take = |events: Vec<JoinEvent>| {
+        for event in events {
+            match event {
+                JoinEvent::Accepted(keyframe) => outcome.keyframes.push(keyframe),
+                JoinEvent::Refused { stamp, why, .. } => outcome.refused.push((stamp.0, why)),
+                JoinEvent::Evicted { stamp, .. } => outcome.evicted.push(stamp.0),
+                JoinEvent::Seen(_) => outcome.n_seen += 1,
+            }
+        }
+    };
+    for sample in samples {
+        take(join.push(sample));
+    }
+    take(join.finish());
+    outcome
+}
+
+fn join(rig: &Rig) -> Join {
+    Join::new(rig).expect("a good rig")
+}
+
+/// What differs between two lists of keyframes, down to the last bit.
+fn differences(a: &[Arc<Keyframe>], b: &[Arc<Keyframe>]) -> Vec<String> {
+    let bits = |keyframe: &Keyframe| {
+        let pose = |pose: &Transform| {
+            let numbers = pose.translation.vector.iter().chain(pose.rotation.coords.iter());
+            numbers.map(|number| number.to_bits()).collect::<Vec<_>>()
+        };
+        let twist = keyframe.twist.map(|twist| {
+            let numbers = twist.linear_m_s.iter().chain(twist.angular_rad_s.iter());
+            numbers.map(|number| number.to_bits()).collect::<Vec<_>>()
+        });
+        let depth = keyframe.depth.as_ref().map(|depth| {
+            let metres: Vec<u32> = depth.depth_m.iter().map(|metres| metres.to_bits()).collect();
+            (metres, pose(&depth.world_from_camera), depth.size_px)
+        });
+        let truth = keyframe.truth.as_ref().map(|truth| (truth.rgba_srgb.to_vec(), pose(&truth.world_from_camera)));
+        let image = (keyframe.camera.to_string(), keyframe.stamp, keyframe.size_px, keyframe.rgba_srgb.to_vec());
+        (image, pose(&keyframe.world_from_camera), twist, depth, truth, keyframe.split)
+    };
+    let mut differences: Vec<String> = a
+        .iter()
+        .zip(b)
+        .enumerate()
+        .filter(|(_, (a, b))| bits(a) != bits(b))
+        .map(|(ix, (a, _))| format!("keyframe {ix} at {} ns", a.stamp.0))
+        .collect();
+    if a.len() != b.len() {
+        differences.push(format!("{} and {} keyframes", a.len(), b.len()));
+    }
+    differences
+}
+
+#[test]
+fn poses_are_those_of_the_shutter_time_of_color_and_of_depth() {
+    const CLOSE: f64 = 1e-7; // A cubic through readings 5 ms apart, of sines of 8 s.
+    let rig = rig(&[]);
+    let outcome = play(&mut join(&rig), samples(8));
+    let chain = Chain::from_urdf(&rig.arm.urdf_text, &rig.arm.base_link, &rig.arm.flange_link).expect("a Panda");
+    let pose_at = |stamp: Stamp| {
+        chain.forward(&joints_rad(stamp.secs())).expect("seven joints") * rig.cameras[0].parent_from_camera
+    };
+    let distance = |a: &Transform, b: &Transform| (a.to_homogeneous() - b.to_homogeneous()).abs().max();
+    assert!(outcome.keyframes.len() > 20, "{} keyframes", outcome.keyframes.len());
+    for keyframe in &outcome.keyframes {
+        assert!(distance(&keyframe.world_from_camera, &pose_at(keyframe.stamp)) < CLOSE);
+        let depth = keyframe.depth.as_ref().expect("depth came with every image");
+        assert!(distance(&depth.world_from_camera, &pose_at(keyframe.stamp.plus_secs(0.005))) < CLOSE);
+        assert!(distance(&depth.world_from_camera, &keyframe.world_from_camera) > 100.0 * CLOSE, "a pose of its own");
+        assert_eq!((depth.depth_m[0], depth.depth_m[1], depth.depth_m[2]), (0.0, 0.0, 1.0));
+        let (before, after) = (pose_at(keyframe.stamp.plus_secs(-1e-4)), pose_at(keyframe.stamp.plus_secs(1e-4)));
+        let twist = kinematics::transform::log(&(before.inverse() * after), 2e-4);
+        let told = keyframe.twist.expect("velocities are told");
+        assert!(
+            (told.linear_m_s - twist.linear_m_s).norm() < 1e-4
+                && (told.angular_rad_s - twist.angular_rad_s).norm() < 1e-4
+        );
+        assert_eq!(keyframe.readout_secs, 0.015);
+    }
+    let splits: Vec<Split> = outcome.keyframes.iter().map(|keyframe| keyframe.split).collect();
+    assert_eq!(splits, (0..splits.len()).map(Split::of).collect::<Vec<_>>());
+}
+
+#[test]
+fn a_clock_offset_of_the_rig_file_moves_stamp_and_pose() {
+    let offset = Value::Table([("value".to_owned(), Value::from(-12.5))].into_iter().collect());
+    let moved = rig(&[Override::new("camera.wrist.stamp_to_mid_exposure_millis", offset)]);
+    let outcome = play(&mut join(&moved), samples(4));
+    let first = &outcome.keyframes[0];
+    assert_eq!(first.stamp.0, 50_000_000 - 23_456_789 - 12_500_000);
+    let plain = play(&mut join(&rig(&[])), samples(4));
+    assert_ne!(first.world_from_camera, plain.keyframes[0].world_from_camera);
+}
+
+#[test]
+fn ground_truth_and_depth_are_attached_whatever_comes_first() {
+    let rig = rig(&[Override::new("sim.truth", true)]);
+    let in_order = samples(6);
+    let plain = play(&mut join(&rig), in_order.clone());
+    assert!(plain.keyframes.iter().all(|keyframe| {
+        let truth = keyframe.truth.as_ref().expect("truth came with every image");
+        truth.rgba_srgb[0] == 99
+            && truth.world_from_camera.translation.z == keyframe.stamp.secs()
+            && truth.psnr_ceiling == Some(42.0)
+    }));
+    // Depth, then truth, then colour; and all images half a second's worth of readings earlier than those.
+    let is_color = |sample: &Sample| matches!(sample, Sample::Image(image) if !image.is_depth());
+    let mut shuffled = in_order.clone();
+    let colors: Vec<usize> = (0..shuffled.len()).filter(|ix| is_color(&shuffled[*ix])).collect();
+    colors.iter().for_each(|ix| shuffled.swap(*ix, ix + 2));
+    let mut early = in_order;
+    early.sort_by_key(|sample| sample.stamp().0 - if matches!(sample, Sample::Joints(_)) { 0 } else { 300_000_000 });
+    for other in [shuffled, early] {
+        assert_eq!(differences(&plain.keyframes, &play(&mut join(&rig), other).keyframes), Vec::<String>::new());
+    }
+}
+
+#[test]
+fn recording_and_replay_give_the_same_keyframes_bit_for_bit() {
+    let rig = rig(&[
+        Override::new("camera.wrist.intrinsics.lens", "brown_conrady"),
+        Override::new("camera.wrist.intrinsics.distortion", Value::from(vec![0.1, -0.05, 0.001, 0.002, 0.0])),
+    ]);
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    let mut recorder = open::recorder(&path, &rig).expect("a new file");
+    let live = play(
+        &mut join(&rig),
+        samples(6).into_iter().inspect(|sample| recorder.write(sample).expect("room on the disk")),
+    );
+    recorder.finish().expect("room on the disk");
+    for _ in 0..2 {
+        let opened = open::recording(&path, None, &[]).expect("a recording");
+        let mut source = opened.source;
+        let replayed = std::iter::from_fn(|| source.next_sample().expect("readable"));
+        let replay = play(&mut join(&opened.rig), replayed);
+        assert_eq!(differences(&live.keyframes, &replay.keyframes), Vec::<String>::new());
+        assert_eq!(live.refused, replay.refused);
+    }
+    assert!(
+        live.keyframes.iter().any(|keyframe| keyframe.rgba_srgb.chunks(4).any(|pixel| pixel[3] == 0)),
+        "undistorted"
+    );
+    // The comparison sees a single bit.
+    let mut changed = (*live.keyframes[3]).clone();
+    changed.world_from_camera.translation.x = f64::from_bits(changed.world_from_camera.translation.x.to_bits() ^ 1);
+    let mut other = live.keyframes.clone();
+    other[3] = Arc::new(changed);
+    assert_eq!(differences(&live.keyframes, &other).len(), 1);
+}
+
+#[test]
+fn images_without_joints_wait_and_are_dropped_with_a_count() {
+    let rig = rig(&[]);
+    // The joints fall silent from 2 s to 4 s, and for good at 6 s.
+    let silent = |nanos: i64| (2_000_000_000..4_000_000_000).contains(&nanos) || nanos > 6_000_000_000;
+    let kept =
+        samples(8).into_iter().filter(|sample| !(matches!(sample, Sample::Joints(_)) && silent(sample.stamp().0)));
+    let mut join = join(&rig);
+    let outcome = play(&mut join, kept);
+    let no_pose: Vec<i64> =
+        outcome.refused.iter().filter(|(_, why)| *why == Refusal::NoPose).map(|(nanos, _)| *nanos).collect();
+    assert!(no_pose.iter().all(|nanos| silent(*nanos)) && no_pose.len() == 40, "{} without a pose", no_pose.len());
+    assert!(outcome.keyframes.iter().all(|keyframe| !silent(keyframe.stamp.0)));
+    assert_eq!(join.counts().refused[&Refusal::NoPose], 40);
+    assert_eq!(join.counts().images, 80);
+    assert_eq!(
+        join.counts().accepted + join.counts().refused.values().sum::<u64>(),
+        80,
+        "every image is accounted for"
+    );
+    assert_eq!(outcome.n_seen, 40);
+}
+
+#[test]
+fn readings_that_are_no_numbers_cost_the_images_around_them() {
+    let rig = rig(&[]);
+    let broken = samples(4).into_iter().map(|sample| match sample {
+        Sample::Joints(mut state) if (1_000_000_000..2_000_000_000).contains(&state.stamp.0) => {
+            state.position[3] = f64::NAN;
+            Sample::Joints(state)
+        }
+        other => other,
+    });
+    let mut join = join(&rig);
+    let outcome = play(&mut join, broken);
+    assert_eq!(join.counts().joints_refused, 200);
+    assert!(join.counts().refused[&Refusal::NoPose] >= 9, "{}", join.counts());
+    assert!(outcome.keyframes.iter().all(|keyframe| super::motion::is_finite(&keyframe.world_from_camera)));
+    let mut short = Join::new(&rig).expect("a good rig");
+    short.push(Sample::Joints(JointState {
+        stamp: Stamp(1),
+        position: vec![0.0; 3],
+        velocity: vec![],
+        effort: vec![],
+    }));
+    assert_eq!(short.counts().joints_refused, 1);
+}
+
+#[test]
+fn every_reason_to_refuse_is_found() {
+    let spoil = |how: fn(Image) -> Image, overrides: &[Override]| {
+        let spoilt = samples(4).into_iter().map(|sample| match sample {
+            Sample::Image(image) if !image.is_depth() && image.stamp.0 > 2_000_000_000 => Sample::Image(how(image)),
+            other => other,
+        });
+        let mut join = join(&rig(overrides));
+        play(&mut join, spoilt);
+        join.counts().clone()
+    };
+    type Case = (Refusal, fn(Image) -> Image, Vec<Override>);
+    let cases: [Case; 8] = [
+        (Refusal::UnknownCamera, |image| Image { camera: "elbow".into(), ..image }, vec![]),
+        (
+            Refusal::NotMoved,
+            |image| image,
+            vec![Override::new("join.min_translation_m", 0.2), Override::new("join.min_rotation_rad", 1.0)],
+        ),
+        (Refusal::Blur, |image| Image { exposure_secs: Some(0.1), ..image }, vec![]),
+        (Refusal::Shear, |image| image, vec![Override::new("join.max_shear_px", 0.05)]),
+        (Refusal::Undecodable, |image| Image { format: PixelFormat::Jpeg, ..image }, vec![]),
+        (Refusal::Undecodable, |image| Image { size_px: [48, 64], ..image }, vec![]),
+        (Refusal::Exposure, |image| Image { data: vec![3; image.data.len()].into(), ..image }, vec![]),
+        (Refusal::NotSharp, |image| Image { data: vec![128; image.data.len()].into(), ..image }, vec![]),
+    ];
+    for (why, how, overrides) in cases {
+        let counts = spoil(how, &overrides);
+        assert!(counts.refused.get(&why).is_some_and(|n| *n >= 3), "{why}: {counts}");
+        assert!(counts.to_string().contains(&why.to_string()));
+    }
+    assert_eq!(
+        spoil(|image| image, &[]).refused.keys().collect::<Vec<_>>(),
+        [&Refusal::NotMoved],
+        "nothing else when all is well"
+    );
+}
+
+#[test]
+fn depth_that_is_missing_costs_the_depth_and_not_the_keyframe() {
+    let without = samples(4)
+        .into_iter()
+        .filter(|sample| !matches!(sample, Sample::Image(image) if image.is_depth() && image.stamp.0 > 2_000_000_000));
+    let mut join = join(&rig(&[]));
+    let outcome = play(&mut join, without);
+    let missing = outcome.keyframes.iter().filter(|keyframe| keyframe.depth.is_none()).count();
+    assert!(missing > 3 && missing < outcome.keyframes.len());
+    assert_eq!(join.counts().without_depth, missing as u64);
+}
+
+#[test]
+fn a_list_takes_exactly_its_keyframes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("keyframes.txt");
+    let mut first = join(&rig(&[]));
+    let chosen = play(&mut first, samples(6));
+    first.write_list(&path).expect("room on the disk");
+    // A rig that would refuse them all.
+    let strict = rig(&[
+        Override::new("join.max_shear_px", 0),
+        Override::new("join.min_translation_m", 10),
+        Override::new("join.max_keyframes", 8),
+    ]);
+    let mut second = join(&strict).taking_only(KeyframeList::load(&path).expect("a list"));
+    let listed = play(&mut second, samples(6));
+    assert_eq!(differences(&chosen.keyframes, &listed.keyframes), Vec::<String>::new());
+    assert_eq!((listed.refused, listed.evicted), (vec![], vec![]));
+    let again = folder.path().join("again.txt");
+    second.write_list(&again).expect("room on the disk");
+    assert_eq!(std::fs::read_to_string(&path).expect("a list"), std::fs::read_to_string(&again).expect("a list"));
+}
+
+#[test]
+fn a_camera_that_stands_still_gives_a_few_keyframes_over_time() {
+    let fixed = rig(&[Override::new("camera.wrist.parent", "world"), Override::new("join.fixed_keyframes", 3)]);
+    let outcome = play(&mut join(&fixed), samples(8));
+    let stamps: Vec<i64> = outcome.keyframes.iter().map(|keyframe| keyframe.stamp.0 / 1_000_000_000).collect();
+    assert_eq!(stamps, [0, 1, 2]);
+    assert!(outcome.keyframes.iter().all(|keyframe| keyframe.world_from_camera == fixed.cameras[0].parent_from_camera));
+}
+
+#[test]
+fn an_hour_leaves_nothing_behind_but_the_store() {
+    let rig = rig(&[Override::new("join.max_keyframes", 24), Override::new("join.min_translation_m", 0.0005)]);
+    let mut join = join(&rig);
+    let (color, depth) = (color("wrist", 0), depth(0));
+    let (mut n_images, mut n_evicted) = (0_u64, 0_u64);
+    for tick in 0..3600 * 20_i64 {
+        let mut samples = vec![reading(tick * 50_000_000)];
+        if tick % 4 == 2 {
+            // Off the beat of the motion, so that every image is a little elsewhere.
+            let stamp = Stamp(tick * 50_000_000 - 21_000_000 - tick % 977 * 10_000);
+            n_images += 1;
+            samples.extend([&color, &depth].map(|image| Sample::Image(Image { stamp, ..image.clone() })));
+        }
+        for event in samples.into_iter().flat_map(|sample| join.push(sample)) {
+            n_evicted += u64::from(matches!(event, JoinEvent::Evicted { .. }));
+        }
+    }
+    join.finish();
+    assert_eq!(join.counts().images, n_images);
+    assert_eq!(join.keyframes().count(), 24);
+    assert!(n_evicted > 20 && n_evicted == join.counts().evicted, "{n_evicted}: {}", join.counts());
+    assert_eq!(join.counts().accepted, 24 + join.counts().evicted);
+    assert!(join.cameras[0].waiting.oldest().is_none());
+}

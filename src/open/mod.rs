@@ -2,6 +2,8 @@
 
 #[cfg(feature = "sim")]
 mod simulated;
+#[cfg(all(test, feature = "sim"))]
+mod simulated_tests;
 
 use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Rig};
 use anyhow::{Context, bail};

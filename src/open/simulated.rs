@@ -27,7 +27,7 @@ pub(super) fn open(rig: &Rig) -> anyhow::Result<Box<dyn Source>> {
 /// Live simulated devices with their ground truth.
 struct RealTime {
     live: Live,
-    truth: sim::live::LiveTruth,
+    truth: sim::LiveTruth,
     first_camera: Arc<str>,
     n_left: Option<u64>,
     end: Option<Stamp>,
