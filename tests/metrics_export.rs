@@ -1,0 +1,116 @@
+//! `fieldrig metrics` and `fieldrig export` as their users run them.
+
+use image::{ExtendedColorType, RgbaImage};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use trainer::ply;
+use trainer::splat::cloud::synthetic_cloud;
+
+fn fieldrig(arguments: &[&str]) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
+    command.env_remove("FIELDRIG_LPIPS_WEIGHTS").args(arguments).output().unwrap()
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+/// The one line of JSON a command printed.
+fn json_of(output: &Output) -> Value {
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+/// What a command that failed with `code` said.
+fn complaint(output: &Output, code: i32) -> String {
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!((output.status.code(), output.stdout.len()), (Some(code), 0), "{said}");
+    said
+}
+
+fn picture(folder: &Path, name: &str, side: u32, level: u8) -> PathBuf {
+    let path = folder.join(name);
+    let shade = |x: u32, y: u32| u8::try_from((7 * x + 13 * y) % 100).unwrap();
+    RgbaImage::from_fn(side, side, |x, y| image::Rgba([shade(x, y) + level, shade(y, x), 9, 255])).save(&path).unwrap();
+    path
+}
+
+#[test]
+fn metrics_of_pictures_are_one_json_object() {
+    let folder = tempfile::tempdir().unwrap();
+    let (a, b) = (picture(folder.path(), "a.png", 20, 6), picture(folder.path(), "b.png", 20, 0));
+    let scores = json_of(&fieldrig(&["metrics", text(&a), text(&b), "--json"]));
+    // One colour of three is off by 6 everywhere.
+    let expected_db = 10.0 * (255.0_f64.powi(2) / 12.0).log10();
+    assert!((scores["psnr"].as_f64().unwrap() - expected_db).abs() < 1e-9, "{scores}");
+    assert!((0.5..1.0).contains(&scores["ssim"].as_f64().unwrap()), "{scores}");
+    assert!(scores["lpips"].is_null() && scores["depth_rmse_m"].is_null(), "{scores}");
+    let for_people = fieldrig(&["metrics", text(&a), text(&b)]);
+    assert!(String::from_utf8_lossy(&for_people.stdout).starts_with("PSNR 37.339 dB  SSIM 0."), "{for_people:?}");
+}
+
+#[test]
+fn metrics_agree_with_the_oracle_through_the_binary() {
+    let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
+    let folder = std::env::var_os("FIELDRIG_TEST_DATA").map_or_else(beside, PathBuf::from).join("metrics");
+    if !folder.is_dir() {
+        eprintln!("skipped: no test data at {}", folder.display());
+        return;
+    }
+    let [a, b, weights] =
+        ["fox_a.png", "fox_b_noise.png", "lpips_squeeze_v0.1.safetensors"].map(|name| folder.join(name));
+    let scores = json_of(&fieldrig(&["metrics", text(&a), text(&b), "--lpips-weights", text(&weights), "--json"]));
+    for (key, expected, tolerance) in
+        [("psnr", 26.664_521_996, 1e-6), ("ssim", 0.566_104_874, 1e-4), ("lpips", 0.270_175_07, 1e-4)]
+    {
+        assert!((scores[key].as_f64().unwrap() - expected).abs() < tolerance, "{key}: {scores}");
+    }
+}
+
+#[test]
+fn metrics_of_depth_images_are_metres() {
+    let folder = tempfile::tempdir().unwrap();
+    let save = |name: &str, counts: [u16; 4]| {
+        let bytes: Vec<u8> = counts.iter().flat_map(|count| count.to_ne_bytes()).collect();
+        let path = folder.path().join(name);
+        image::save_buffer(&path, &bytes, 2, 2, ExtendedColorType::L16).unwrap();
+        path
+    };
+    let (a, b) = (save("a.png", [1000, 2000, 0, 3000]), save("b.png", [1010, 1990, 500, 0]));
+    let scores = json_of(&fieldrig(&["metrics", text(&a), text(&b), "--json"]));
+    assert!((scores["depth_rmse_m"].as_f64().unwrap() - 0.01).abs() < 1e-6 && scores["psnr"].is_null(), "{scores}");
+}
+
+#[test]
+fn pictures_that_cannot_be_compared_are_told_in_one_sentence() {
+    let folder = tempfile::tempdir().unwrap();
+    let (a, b) = (picture(folder.path(), "a.png", 20, 0), picture(folder.path(), "b.png", 30, 0));
+    let said = complaint(&fieldrig(&["metrics", text(&a), text(&b)]), 1);
+    assert!(said.contains("a.png is 20x20 pixels") && said.contains("pictures must have one size"), "{said}");
+    std::fs::write(&b, b"not a picture").unwrap();
+    assert!(complaint(&fieldrig(&["metrics", text(&a), text(&b)]), 1).contains("b.png"));
+    let small = picture(folder.path(), "small.png", 10, 0);
+    let said = complaint(&fieldrig(&["metrics", text(&small), text(&small)]), 1);
+    assert!(said.contains("SSIM needs pictures of at least 11x11 pixels"), "{said}");
+}
+
+#[test]
+fn a_model_is_exported_as_ply() {
+    let folder = tempfile::tempdir().unwrap();
+    let (model, out) = (folder.path().join("model"), folder.path().join("scene.ply"));
+    std::fs::create_dir(&model).unwrap();
+    let splats = synthetic_cloud(20, 1);
+    ply::write(&model.join("splats.ply"), &splats).unwrap();
+    let output = fieldrig(&["export", text(&model), "--to", "ply", "--out", text(&out)]);
+    assert!(output.status.success(), "{output:?}");
+    assert_eq!(ply::read(&out).unwrap(), splats);
+
+    let said = complaint(&fieldrig(&["export", text(&model), "--to", "nerfstudio", "--out", text(&out)]), 2);
+    assert!(said.contains("nerfstudio is written of a recording"), "{said}");
+    let nothing = folder.path().join("nothing");
+    let said = complaint(&fieldrig(&["export", text(&nothing), "--to", "ply", "--out", text(&out)]), 2);
+    assert!(said.contains("neither a folder with splats.ply nor a recording"), "{said}");
+    let said = complaint(&fieldrig(&["export", text(&out), "--to", "nerfstudio", "--out", text(&nothing)]), 1);
+    assert!(said.contains("is not a recording"), "{said}");
+}
