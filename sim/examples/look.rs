@@ -1,8 +1,9 @@
 //! Plays the default rig and writes its pictures into a folder, to look at and to time.
 //!
-//! `cargo run --release -p sim --example look -- FOLDER N_IMAGES [EVERY] [720p|two|ideal]`
+//! `cargo run --release -p sim --example look -- FOLDER N_IMAGES [EVERY] [720p|two|notruth|global|ideal]`
 
 use drivers::{PixelFormat, Sample, Source};
+use nalgebra::{Isometry3, Point3, Vector3};
 use sim::{CameraConfig, Config, Parent};
 use std::time::Instant;
 
@@ -22,12 +23,21 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         }
         "two" => {
             let mut fixed = CameraConfig::wrist("fixed");
+            fixed.intrinsics = fixed.intrinsics.resized([1280, 720]);
+            fixed.intrinsics.focal_px = [1480.0, 1478.0];
+            fixed.intrinsics.lens = kinematics::Lens::BrownConrady([0.06, -0.12, 0.0005, -0.0003, 0.0]);
             fixed.parent = Parent::World;
+            fixed.parent_from_camera =
+                Isometry3::face_towards(&Point3::new(1.0, 0.0, 0.75), &Point3::new(0.70, 0.0, 0.15), &-Vector3::z());
             fixed.depth = None;
             fixed.rate_hz = 5.0;
             config.cameras.push(fixed);
         }
         "notruth" => config.truth = false,
+        "global" => {
+            config.truth = false;
+            config.cameras[0].sensor.readout_micros = 0.0;
+        }
         "ideal" => config.ideal = true,
         _ => {}
     }

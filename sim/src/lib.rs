@@ -8,10 +8,12 @@ pub mod config;
 mod egl;
 mod engine;
 mod error;
+mod light;
 mod live;
 mod lockstep;
 mod mesh;
 mod noise;
+mod objects;
 mod optics;
 mod panda;
 mod random;
@@ -23,8 +25,13 @@ pub mod tag;
 mod texture;
 mod toy;
 
+/// Where the objects of the static-arm scene are, for whoever checks pictures of it.
+pub mod layout {
+    pub use crate::objects::{BLOCK_HALF_M, CUBE_HALF_M, TABLE_Z_M, TARGET_XY_M, world_from_block, world_from_cube};
+}
+
 pub use config::{CameraConfig, Config, DepthConfig, Parent, Scene, SensorConfig};
 pub use error::Error;
-pub use live::LiveRig;
+pub use live::{LiveRig, LiveTruth};
 pub use lockstep::Lockstep;
 pub use rig::{CameraInfo, PANDA_URDF, Rig, RigInfo, open};

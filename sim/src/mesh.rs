@@ -74,13 +74,15 @@ impl Mesh {
         mesh
     }
 
-    /// An ellipsoid around the origin of a frame given by three half axes.
+    /// An ellipsoid given by three perpendicular half axes; `texture_x` tells where in the texture a point looks up its
+    /// colour, by the point and its normal, and `texture_y` is the same for all.
     pub(crate) fn add_ellipsoid(
         &mut self,
         center: Point3<f64>,
         half_axes: [Vector3<f64>; 3],
         n_rings: u32,
-        texture: TextureRect,
+        texture_x: impl Fn(&Point3<f64>, &Vector3<f64>) -> f64,
+        texture_y: f64,
     ) {
         let n_sectors = 2 * n_rings;
         let first = i32::try_from(self.points_m.len()).expect("meshes stay small");
@@ -89,13 +91,11 @@ impl Mesh {
                 let down = f64::from(ring) / f64::from(n_rings);
                 let around = f64::from(sector) / f64::from(n_sectors);
                 let direction = sphere_direction(down, around);
-                let point = |direction: &Vector3<f64>| {
-                    half_axes[0] * direction.x + half_axes[1] * direction.y + half_axes[2] * direction.z
-                };
                 let normal = ellipsoid_normal(&half_axes, &direction);
-                let texcoord =
-                    [texture[0] + (texture[2] - texture[0]) * around, texture[1] + (texture[3] - texture[1]) * down];
-                self.push(Corner { point_m: center + point(&direction), normal, texcoord });
+                let point_m =
+                    center + half_axes[0] * direction.x + half_axes[1] * direction.y + half_axes[2] * direction.z;
+                let texcoord = [texture_x(&point_m, &normal), texture_y];
+                self.push(Corner { point_m, normal, texcoord });
             }
         }
         let row = i32::try_from(n_sectors + 1).expect("meshes stay small");
@@ -106,6 +106,14 @@ impl Mesh {
                 self.triangle([a, b + 1, a + 1]);
             }
         }
+    }
+
+    /// Point and outward normal of a box's side, by the position in its texture, 0 to 1 from the top left.
+    pub(crate) fn on_cuboid(half_m: [f64; 3], side: usize, u: f64, v: f64) -> (Point3<f64>, Vector3<f64>) {
+        let (outward, right, up) = BOX_FACES[side];
+        let unit =
+            Vector3::from(outward) + Vector3::from(right) * (2.0 * u - 1.0) + Vector3::from(up) * (1.0 - 2.0 * v);
+        (Point3::from(unit.component_mul(&Vector3::from(half_m))), Vector3::from(outward))
     }
 
     /// Moves every point.

@@ -28,7 +28,7 @@ pub(crate) fn add_color_noise(colors: &[f32], sensor: &SensorConfig, random: Ran
                 let normals = random.normals((chunk * PIXELS_A_CHUNK + ix) as u64);
                 for channel in 0..3 {
                     let level = usize::from(to_byte(colors[channel]));
-                    bytes[channel] = to_byte(sigma[level].mul_add(normals[channel], colors[channel]));
+                    bytes[channel] = to_byte(colors[channel] + sigma[level] * normals[channel]);
                 }
             }
         },
@@ -76,8 +76,8 @@ pub(crate) fn depth_counts(
 }
 
 /// Where a stereo camera finds no match: beside depth edges first, then in small clusters.
-struct Holes<'a> {
-    depth_m: &'a [f32],
+struct Holes {
+    is_edge: Vec<bool>,
     width: usize,
     random: Random,
     edge_share: f64,
@@ -91,33 +91,38 @@ const CLUSTER_PX: usize = 4;
 /// Counters of the holes start here, beyond those of the noise.
 const HOLE_COUNTERS: u64 = 1 << 40;
 
-impl<'a> Holes<'a> {
-    fn new(depth_m: &'a [f32], width: usize, hole_frac: f64, random: Random) -> Self {
-        let mut holes = Self { depth_m, width, random, edge_share: 0.0, cluster_share: 0.0 };
-        let n_edge = (0..depth_m.len()).filter(|&ix| holes.is_edge(ix)).count() as f64;
+impl Holes {
+    fn new(depth_m: &[f32], width: usize, hole_frac: f64, random: Random) -> Self {
+        let mut is_edge = vec![false; depth_m.len()];
+        is_edge
+            .par_chunks_mut(width)
+            .zip(depth_m.par_chunks(width))
+            .for_each(|(is_edge, depth_m)| mark_edges(is_edge, depth_m));
+        let n_edge = is_edge.iter().filter(|is_edge| **is_edge).count() as f64;
         let n_wanted = hole_frac * depth_m.len() as f64;
-        holes.edge_share = (0.7 * n_wanted / n_edge.max(1.0)).min(MAX_EDGE_SHARE);
+        let edge_share = (0.7 * n_wanted / n_edge.max(1.0)).min(MAX_EDGE_SHARE);
         let n_rest = depth_m.len() as f64 - n_edge;
-        holes.cluster_share = ((n_wanted - holes.edge_share * n_edge) / n_rest.max(1.0)).clamp(0.0, 1.0);
-        holes
-    }
-
-    /// Whether depth jumps within two pixels to the left or right, where one eye sees what the other does not.
-    fn is_edge(&self, ix: usize) -> bool {
-        const JUMP_FRAC: f32 = 0.03;
-        let column = ix % self.width;
-        let (before, after) = (ix - column.min(2), ix + (self.width - 1 - column).min(2));
-        let (a, b) = (self.depth_m[before], self.depth_m[after]);
-        (a - b).abs() > JUMP_FRAC * a.min(b)
+        let cluster_share = ((n_wanted - edge_share * n_edge) / n_rest.max(1.0)).clamp(0.0, 1.0);
+        Self { is_edge, width, random, edge_share, cluster_share }
     }
 
     fn contains(&self, ix: usize) -> bool {
-        if self.is_edge(ix) {
+        if self.is_edge[ix] {
             return self.random.unit(HOLE_COUNTERS + ix as u64) < self.edge_share;
         }
         let (row, column) = (ix / self.width, ix % self.width);
         let cluster = (row / CLUSTER_PX * self.width + column / CLUSTER_PX) as u64;
         self.random.unit(2 * HOLE_COUNTERS + cluster) < self.cluster_share
+    }
+}
+
+/// Marks the pixels of a row where depth jumps within two pixels, where one eye sees what the other does not.
+fn mark_edges(is_edge: &mut [bool], depth_m: &[f32]) {
+    const REACH_PX: usize = 2;
+    const JUMP_FRAC: f32 = 0.03;
+    for (column, window) in depth_m.windows(2 * REACH_PX + 1).enumerate() {
+        let (a, b) = (window[0], window[2 * REACH_PX]);
+        is_edge[column + REACH_PX] = (a - b).abs() > JUMP_FRAC * a.min(b);
     }
 }
 

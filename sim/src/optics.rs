@@ -14,12 +14,15 @@ use rayon::prelude::{IndexedParallelIterator, ParallelIterator, ParallelSliceMut
 pub(crate) struct Optics {
     intrinsics: Intrinsics,
     supersample: u32,
+    margin_px: u32,
     /// `[height, width]`: x and y of the point at z = 1 that each pixel's centre sees.
     rays: Vec<[f32; 2]>,
     /// Size and pinhole of the pictures to draw: the image and a margin, supersampled.
     view_size_px: [u32; 2],
     view_focal_px: [f64; 2],
     view_principal_px: [f64; 2],
+    /// Focal length and principal point of those pictures again, for single pixels.
+    drawn_pinhole_px: [[f32; 2]; 2],
 }
 
 /// Pose of the drawn picture as seen by the camera at another instant, in f32.
@@ -39,7 +42,9 @@ impl Shift {
 }
 
 /// Corrections of the pixel position until the depth found there agrees with the ray.
-const N_CORRECTIONS: usize = 3;
+const MAX_CORRECTIONS: usize = 3;
+/// Depths that agree to this share put a point at the same place within 0.02 pixels at the speeds of the arm.
+const SAME_DEPTH_FRAC: f32 = 0.005;
 
 impl Optics {
     pub(crate) fn new(camera: &CameraConfig, is_sharp: bool) -> Result<Self, Error> {
@@ -61,8 +66,10 @@ impl Optics {
             view_size_px: [0; 2],
             view_focal_px: intrinsics.focal_px.map(|focal| focal * f64::from(supersample)),
             view_principal_px: [0.0; 2],
+            drawn_pinhole_px: [[0.0; 2]; 2],
             intrinsics,
             supersample,
+            margin_px,
             rays,
         };
         for axis in 0..2 {
@@ -73,6 +80,8 @@ impl Optics {
             let extent = ((last - first) * optics.view_focal_px[axis] + 2.0 * margin - 1e-2).ceil();
             optics.view_size_px[axis] = extent.clamp(1.0, f64::from(MAX_VIEW_PX)) as u32;
         }
+        optics.drawn_pinhole_px =
+            [optics.view_focal_px, optics.view_principal_px].map(|pair| pair.map(|value| value as f32));
         Ok(optics)
     }
 
@@ -106,11 +115,34 @@ impl Optics {
 
     /// What each pixel sees at the picture's own instant: `[height, width, 3]`, 0 to 255.
     pub(crate) fn sharp(&self, picture: &Picture) -> Vec<f32> {
+        if self.intrinsics.is_pinhole() {
+            return self.expose(|row, colors| self.average_blocks(picture, row, colors));
+        }
         self.expose(|row, colors| {
             for (color, ray) in colors.iter_mut().zip(self.row_of_rays(row)) {
                 *color = self.color_at(picture, self.drawn_from_ray(ray));
             }
         })
+    }
+
+    /// One row of a pinhole's pixels, each of which covers whole pixels of the drawn picture.
+    fn average_blocks(&self, picture: &Picture, row: usize, colors: &mut [[f32; 3]]) {
+        let (side, stride) = (self.supersample as usize, 3 * picture.size_px[0] as usize);
+        let margin = (self.margin_px * self.supersample) as usize;
+        let area = (side * side) as f32;
+        let top = (margin + row * side) * stride + 3 * margin;
+        for (column, color) in colors.iter_mut().enumerate() {
+            let mut sum = [0u16; 3];
+            for y in 0..side {
+                let start = top + y * stride + 3 * column * side;
+                for pixel in picture.rgb[start..start + 3 * side].chunks_exact(3) {
+                    for channel in 0..3 {
+                        sum[channel] += u16::from(pixel[channel]);
+                    }
+                }
+            }
+            *color = sum.map(|channel| f32::from(channel) / area);
+        }
     }
 
     /// What each pixel sees when its row is exposed at other instants, of which the mean counts.
@@ -123,8 +155,13 @@ impl Optics {
         let share = 1.0 / n_samples as f32;
         self.expose(|row, colors| {
             for shift in &shifts[row * n_samples..(row + 1) * n_samples] {
+                // A pixel's neighbour has moved by almost as much: where the search starts.
+                let mut moved = [0.0; 2];
                 for (color, ray) in colors.iter_mut().zip(self.row_of_rays(row)) {
-                    let seen = self.color_at(picture, self.follow(picture, shift, ray));
+                    let still = self.drawn_from_ray(ray);
+                    let drawn = self.follow(picture, shift, ray, [still[0] + moved[0], still[1] + moved[1]]);
+                    moved = [drawn[0] - still[0], drawn[1] - still[1]];
+                    let seen = self.color_at(picture, drawn);
                     for channel in 0..3 {
                         color[channel] += share * seen[channel];
                     }
@@ -159,16 +196,25 @@ impl Optics {
 
     /// Position in the drawn picture of the point `(x, y, 1)`.
     fn drawn_from_ray(&self, ray: &[f32; 2]) -> [f32; 2] {
-        [0, 1].map(|axis| ray[axis].mul_add(self.view_focal_px[axis] as f32, self.view_principal_px[axis] as f32))
+        let [[focal_x, focal_y], [center_x, center_y]] = self.drawn_pinhole_px;
+        [ray[0] * focal_x + center_x, ray[1] * focal_y + center_y]
     }
 
-    fn follow(&self, picture: &Picture, shift: &Shift, ray: &[f32; 2]) -> [f32; 2] {
+    /// Where a ray of the shifted camera meets the drawn surface, searched from a first guess.
+    fn follow(&self, picture: &Picture, shift: &Shift, ray: &[f32; 2], guess: [f32; 2]) -> [f32; 2] {
         let direction = shift.turn * Vector3::new(ray[0], ray[1], 1.0);
-        let mut drawn = self.drawn_from_ray(ray);
-        for _ in 0..N_CORRECTIONS {
-            let along = (nearest_depth(picture, drawn) - shift.offset_m.z) / direction.z;
-            let point = direction * along + shift.offset_m;
-            drawn = self.drawn_from_ray(&[point.x / point.z, point.y / point.z]);
+        let mut depth = nearest_depth(picture, guess);
+        let mut drawn = guess;
+        for _ in 0..MAX_CORRECTIONS {
+            let along = (depth - shift.offset_m.z) / direction.z;
+            let at = |axis: usize| (direction[axis] * along + shift.offset_m[axis]) / depth;
+            drawn = self.drawn_from_ray(&[at(0), at(1)]);
+            let found = nearest_depth(picture, drawn);
+            let is_same = (found - depth).abs() < SAME_DEPTH_FRAC * depth;
+            depth = found;
+            if is_same {
+                break;
+            }
         }
         drawn
     }
@@ -176,6 +222,9 @@ impl Optics {
     /// Mean colour of the square of one image pixel around a position in the drawn picture.
     fn color_at(&self, picture: &Picture, at: [f32; 2]) -> [f32; 3] {
         let side = self.supersample as usize;
+        if side == 1 {
+            return between_pixels(picture, at);
+        }
         let [width, height] = picture.size_px.map(|side| side as usize);
         let start = |axis: usize, size: usize| {
             let first = (at[axis] - 0.5 * side as f32).clamp(0.0, (size - side) as f32 - 1e-3);
@@ -214,6 +263,25 @@ impl Optics {
         let furthest = depths.into_iter().fold(0.0, f32::max);
         if furthest - nearest < SAME_SURFACE_FRAC * nearest { depths.iter().sum::<f32>() / 4.0 } else { nearest }
     }
+}
+
+/// Colour at a position between four pixels' centres.
+fn between_pixels(picture: &Picture, at: [f32; 2]) -> [f32; 3] {
+    let [width, height] = picture.size_px;
+    let x = (at[0] - 0.5).clamp(0.0, width as f32 - 1.001);
+    let y = (at[1] - 0.5).clamp(0.0, height as f32 - 1.001);
+    let (column, row) = (x as usize, y as usize);
+    let (fx, fy) = (x - column as f32, y - row as f32);
+    let stride = 3 * width as usize;
+    let start = row * stride + 3 * column;
+    let (above, below) = (&picture.rgb[start..start + 6], &picture.rgb[start + stride..start + stride + 6]);
+    let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
+    std::array::from_fn(|channel| {
+        weights[0] * f32::from(above[channel])
+            + weights[1] * f32::from(above[channel + 3])
+            + weights[2] * f32::from(below[channel])
+            + weights[3] * f32::from(below[channel + 3])
+    })
 }
 
 /// Larger pictures are not drawn, whatever the lens.

@@ -2,8 +2,8 @@
 
 use crate::Error;
 use crate::config::N_JOINTS;
+use crate::objects::{TABLE_Z_M, TARGET_XY_M};
 use crate::panda::{self, Jacobian, Joints};
-use crate::scene::{TABLE_Z_M, TARGET_XY_M};
 use kinematics::Transform;
 use nalgebra::{Matrix3, Matrix6, Rotation3, SMatrix, Translation3, UnitQuaternion, Vector3, Vector6};
 use std::f64::consts::TAU;

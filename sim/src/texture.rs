@@ -5,6 +5,7 @@ use crate::random::Random;
 use crate::tag;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
+use rayon::prelude::{IndexedParallelIterator, IntoParallelIterator, ParallelIterator, ParallelSliceMut};
 
 /// Colour, sRGB 0 to 1.
 pub(crate) type Color = [f64; 3];
@@ -17,15 +18,50 @@ pub(crate) struct Texture {
 
 impl Texture {
     /// Paints every pixel by its position, both coordinates from 0 to 1, from the top left.
-    fn paint(side_px: usize, color_at: impl Fn(f64, f64) -> Color) -> Self {
-        let mut rgb = Vec::with_capacity(3 * side_px * side_px);
-        for row in 0..side_px {
-            for column in 0..side_px {
-                let at = |ix: usize| (ix as f64 + 0.5) / side_px as f64;
-                rgb.extend(color_at(at(column), at(row)).map(to_byte));
+    fn paint(side_px: usize, color_at: impl Fn(f64, f64) -> Color + Sync) -> Self {
+        let at = |ix: usize| (ix as f64 + 0.5) / side_px as f64;
+        let mut rgb = vec![0; 3 * side_px * side_px];
+        rgb.par_chunks_mut(3 * side_px).enumerate().for_each(|(row, line)| {
+            for (column, pixel) in line.chunks_exact_mut(3).enumerate() {
+                pixel.copy_from_slice(&color_at(at(column), at(row)).map(to_byte));
             }
-        }
+        });
         Self { side_px, rgb }
+    }
+
+    /// Darkens a rectangle (left, top, right, bottom) by shares of light that are told on `n` by `n` points of it.
+    ///
+    /// `share_at` takes the position in the rectangle, 0 to 1 from its top left, and a number of its own.
+    pub(crate) fn shade(&mut self, rectangle: [f64; 4], n: usize, share_at: impl Fn(f64, f64, u64) -> f64 + Sync) {
+        let step = 1.0 / (n - 1) as f64;
+        // On the very edge a point may lie inside its neighbour.
+        let inside = |at: usize| (at as f64 * step).clamp(EDGE, 1.0 - EDGE);
+        let shares: Vec<f64> =
+            (0..n * n).into_par_iter().map(|ix| share_at(inside(ix % n), inside(ix / n), ix as u64)).collect();
+        let shares = blurred(&shares, n);
+        let smooth = |x: f64, y: f64| {
+            let (column, row) = (x.clamp(0.0, 1.0) / step, y.clamp(0.0, 1.0) / step);
+            let (left, top) = ((column as usize).min(n - 2), (row as usize).min(n - 2));
+            let (fx, fy) = (column - left as f64, row - top as f64);
+            let line = |at: usize| shares[at * n + left] * (1.0 - fx) + shares[at * n + left + 1] * fx;
+            line(top) * (1.0 - fy) + line(top + 1) * fy
+        };
+        let side_px = self.side_px;
+        let [left, top, right, bottom] = rectangle;
+        let first = |share: f64| (share * side_px as f64 + 0.5) as usize;
+        let (columns, rows) = (first(left)..first(right), first(top)..first(bottom));
+        self.rgb.par_chunks_mut(3 * side_px).enumerate().filter(|(row, _)| rows.contains(row)).for_each(
+            |(row, line)| {
+                let y = ((row as f64 + 0.5) / side_px as f64 - top) / (bottom - top);
+                for column in columns.clone() {
+                    let x = ((column as f64 + 0.5) / side_px as f64 - left) / (right - left);
+                    let share = smooth(x, y);
+                    for byte in &mut line[3 * column..3 * column + 3] {
+                        *byte = (f64::from(*byte) * share + 0.5) as u8;
+                    }
+                }
+            },
+        );
     }
 
     /// The texture as a PNG file.
@@ -44,6 +80,20 @@ impl Texture {
 
 /// Side of every texture, pixels.
 const SIDE_PX: usize = 1024;
+
+/// How far from a rectangle's edge light is told at the least, as a share of its side.
+const EDGE: f64 = 0.005;
+
+/// Mean of each point of a square grid and its neighbours.
+fn blurred(grid: &[f64], side: usize) -> Vec<f64> {
+    let around = |at: usize| at.saturating_sub(1)..(at + 2).min(side);
+    let mean = |ix: usize| {
+        let (rows, columns) = (around(ix / side), around(ix % side));
+        let n_points = (rows.len() * columns.len()) as f64;
+        rows.flat_map(|row| grid[row * side..][columns.clone()].iter()).sum::<f64>() / n_points
+    };
+    (0..grid.len()).map(mean).collect()
+}
 
 fn to_byte(value: f64) -> u8 {
     (value.clamp(0.0, 1.0) * 255.0 + 0.5) as u8
@@ -192,63 +242,82 @@ fn stripes(u: f64, v: f64) -> Color {
     scale(color, 0.82 + 0.18 * (wave.fract() * 3.0).fract())
 }
 
-/// A brushed metal table with threaded holes every 25 mm, when one texture covers 0.8 m.
-pub(crate) fn metal_table() -> Texture {
-    const N_HOLES: f64 = 32.0;
+/// A brushed metal table with threaded holes every 25 mm.
+///
+/// * `size_m`: what the texture covers to the right and down.
+pub(crate) fn metal_table(size_m: [f64; 2]) -> Texture {
+    const HOLE_PITCH_M: f64 = 0.025;
     let (brush, blotch, scratch) = (Noise::new(31), Noise::new(32), Noise::new(33));
-    Texture::paint(SIDE_PX, |x, y| {
+    Texture::paint(3 * SIDE_PX / 2, |x, y| {
+        // Noise was chosen for a square of 0.8 m.
+        let (x, y) = (x * size_m[0] / 0.8, y * size_m[1] / 0.8);
         let brushed = 0.6 * brush.at(x * 9.0, y * 480.0) + 0.4 * brush.rough(x * 40.0, y * 260.0, 3);
         let worn = blotch.rough(x * 6.0, y * 6.0, 5);
-        let metal = scale(mix([0.40, 0.43, 0.47], [0.66, 0.66, 0.64], step(0.25, 0.75, worn)), 0.78 + 0.4 * brushed);
+        let metal = scale(mix([0.28, 0.32, 0.38], [0.82, 0.80, 0.76], step(0.3, 0.68, worn)), 0.72 + 0.5 * brushed);
         let line = (scratch.at(x * 12.0 + y * 3.0, y * 14.0 - x * 9.0) - 0.5).abs();
         let metal = mix([0.86, 0.87, 0.88], metal, step(0.001, 0.008, line));
-        let from_hole = ((x * N_HOLES).fract() - 0.5).hypot((y * N_HOLES).fract() - 0.5);
-        let rim = mix([0.82, 0.83, 0.84], metal, step(0.17, 0.22, from_hole));
-        mix([0.06, 0.06, 0.07], rim, step(0.125, 0.155, from_hole))
+        let in_pitch = |at: f64| (at * 0.8 / HOLE_PITCH_M).fract() - 0.5;
+        let from_hole = in_pitch(x).hypot(in_pitch(y));
+        let rim = mix([0.90, 0.91, 0.92], metal, step(0.21, 0.26, from_hole));
+        mix([0.05, 0.05, 0.06], rim, step(0.165, 0.19, from_hole))
     })
 }
 
-/// Sawn wood: grain in the upper three quarters, end grain with rings in the lowest quarter.
+/// Sawn wood: six sides in the rectangles of [`side_rectangle`], the first two with end grain.
 pub(crate) fn wood() -> Texture {
-    let (bend, fiber) = (Noise::new(41), Noise::new(42));
+    let grain = Grain { bend: Noise::new(41), fiber: Noise::new(42) };
+    Texture::paint(SIDE_PX, |x, y| {
+        let side = (y * 3.0).floor() * 3.0 + (x * 3.0).floor();
+        let (u, v) = ((x * 3.0).fract(), (y * 3.0).fract());
+        if side < 2.0 { grain.end(u, v, side) } else { grain.along(u, v, side) }
+    })
+}
+
+struct Grain {
+    bend: Noise,
+    fiber: Noise,
+}
+
+impl Grain {
     const DARK: Color = [0.42, 0.24, 0.11];
     const LIGHT: Color = [0.83, 0.62, 0.38];
-    Texture::paint(SIDE_PX, |x, y| {
-        let fine = fiber.rough(x * 14.0, y * 260.0, 3);
-        if y < END_GRAIN_TOP {
-            let knot = (-((x - 0.62) / 0.10).powi(2) - ((y - 0.3) / 0.05).powi(2)).exp();
-            let ring = y * 26.0 + 3.2 * bend.rough(x * 2.2, y * 5.0, 3) + 2.5 * knot;
-            let grain = (ring.fract() * 1.25).min(1.0 - (ring.fract() - 0.8).max(0.0) * 5.0);
-            let color = mix(LIGHT, DARK, 0.75 * grain * grain + 0.25 * (1.0 - fine));
-            return mix(color, [0.22, 0.12, 0.06], 0.8 * step(0.5, 0.95, knot));
-        }
-        let (u, v) = (x - 0.35, (y - END_GRAIN_TOP) / (1.0 - END_GRAIN_TOP) - 1.4);
-        let radius = u.hypot(v) * 24.0 + 1.4 * bend.rough(x * 4.0, y * 16.0, 3);
-        let speckle = fiber.rough(x * 150.0, y * 150.0, 2);
-        mix(scale(LIGHT, 0.9), DARK, 0.8 * radius.fract().powi(2) + 0.3 * speckle)
-    })
+
+    fn along(&self, u: f64, v: f64, side: f64) -> Color {
+        let fine = self.fiber.rough(u * 12.0, v * 90.0 + side * 31.0, 3);
+        let (knot_u, knot_v) = (0.25 + 0.5 * (side * 0.37).fract(), 0.35 + 0.3 * (side * 0.61).fract());
+        let knot = (-((u - knot_u) / 0.09).powi(2) - ((v - knot_v) / 0.13).powi(2)).exp();
+        let ring = v * 9.0 + side * 2.3 + 3.2 * self.bend.rough(u * 2.2 + side * 5.0, v * 2.0, 3) + 2.5 * knot;
+        let late = (ring.fract() * 1.25).min(1.0 - (ring.fract() - 0.8).max(0.0) * 5.0);
+        let color = mix(Self::LIGHT, Self::DARK, 0.75 * late * late + 0.25 * (1.0 - fine));
+        mix(color, [0.22, 0.12, 0.06], 0.8 * step(0.5, 0.95, knot))
+    }
+
+    fn end(&self, u: f64, v: f64, side: f64) -> Color {
+        let radius = (u - 0.3).hypot(v - 1.4) * 9.0 + 1.2 * self.bend.rough(u * 3.0 + side * 9.0, v * 3.0, 3);
+        let speckle = self.fiber.rough(u * 50.0 + side * 80.0, v * 50.0, 2);
+        mix(scale(Self::LIGHT, 0.9), Self::DARK, 0.8 * radius.fract().powi(2) + 0.3 * speckle)
+    }
 }
 
-/// Where the end grain begins in the wood texture.
-pub(crate) const END_GRAIN_TOP: f64 = 0.75;
-
-/// Fur colours. Left to right: single hairs; top to bottom of a band: tip to root. Bands: [`FurBand`].
+/// Fur colours, brighter to the right. Top to bottom of a band: tip to root. Bands: [`FurBand`].
 pub(crate) fn fur() -> Texture {
-    let (hair, skin) = (Noise::new(51), Noise::new(52));
-    Texture::paint(SIDE_PX, |x, y| {
+    let skin = Noise::new(52);
+    Texture::paint(SIDE_PX / 2, |x, y| {
         let band = (y * 4.0).floor();
         let to_root = (y * 4.0).fract();
-        let tone = hair.rough(x * 250.0, band * 7.0, 2);
         let (tip, root): (Color, Color) = match band as i64 {
-            0 => ([0.74, 0.66, 0.57], [0.27, 0.21, 0.17]),
-            1 => ([0.96, 0.93, 0.87], [0.62, 0.55, 0.47]),
-            2 => ([0.25, 0.17, 0.13], [0.08, 0.06, 0.05]),
-            _ => ([0.90, 0.66, 0.62], [0.70, 0.46, 0.44]),
+            0 => ([0.78, 0.70, 0.60], [0.30, 0.24, 0.19]),
+            1 => ([1.0, 0.96, 0.90], [0.66, 0.58, 0.50]),
+            2 => ([0.27, 0.19, 0.14], [0.09, 0.07, 0.05]),
+            _ => ([0.94, 0.70, 0.66], [0.72, 0.48, 0.46]),
         };
-        let color = scale(mix(tip, root, to_root.powf(0.8)), 0.62 + 0.7 * tone);
-        scale(color, 0.92 + 0.16 * skin.rough(x * 30.0, y * 60.0, 3))
+        let color = scale(mix(tip, root, to_root.powf(0.8)), FUR_DARKEST + (1.0 - FUR_DARKEST) * x);
+        scale(color, 0.94 + 0.12 * skin.rough(x * 60.0, y * 60.0, 3))
     })
 }
+
+/// Brightness at the left edge of the fur texture; 1 at the right.
+pub(crate) const FUR_DARKEST: f64 = 0.15;
 
 /// Bands of the fur texture from the top.
 #[derive(Clone, Copy)]
@@ -271,12 +340,12 @@ impl FurBand {
     }
 }
 
-/// Six tags in two rows of three, ids from the left and from the top; the lowest third is white.
+/// Six tags in the rectangles of [`side_rectangle`]; the lowest third is white.
 pub(crate) fn tags() -> Texture {
     let cells: Vec<_> = (0..tag::CODES.len()).map(tag::cells).collect();
     let paper = Noise::new(61);
-    // Twice the usual size, so that an edge between cells stays sharp close up.
-    Texture::paint(2 * SIDE_PX, |x, y| {
+    // Larger than the others, so that an edge between cells stays sharp close up.
+    Texture::paint(3 * SIDE_PX / 2, |x, y| {
         let (across, down) = (x * 3.0, y * 3.0);
         let light = 0.97 + 0.03 * paper.rough(x * 200.0, y * 200.0, 2);
         let id = down.floor() as usize * 3 + across.floor() as usize;
@@ -289,9 +358,9 @@ pub(crate) fn tags() -> Texture {
     })
 }
 
-/// Rectangle of a tag in [`tags`]: left, top, right, bottom.
-pub(crate) fn tag_rectangle(id: usize) -> [f64; 4] {
-    let (column, row) = ((id % 3) as f64, (id / 3) as f64);
+/// Rectangle of a box's side in its texture, two rows of three from the top left: left, top, right, bottom.
+pub(crate) fn side_rectangle(side: usize) -> [f64; 4] {
+    let (column, row) = ((side % 3) as f64, (side / 3) as f64);
     [column / 3.0, row / 3.0, (column + 1.0) / 3.0, (row + 1.0) / 3.0]
 }
 

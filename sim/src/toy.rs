@@ -2,7 +2,7 @@
 
 use crate::mesh::{Corner, Mesh, ellipsoid_normal, sphere_direction};
 use crate::random::Random;
-use crate::texture::FurBand;
+use crate::texture::{FUR_DARKEST, FurBand};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 
 /// One part of the body: an ellipsoid, covered with hair or not.
@@ -43,6 +43,9 @@ impl Part {
     }
 }
 
+/// Halves of the hair numbers below that grow.
+const DENSITY: u64 = 3;
+
 /// The toy stands on z = 0, looks along x, and is 0.15 m high.
 const PARTS: [Part; 22] = [
     // Trunk, chest and belly.
@@ -74,51 +77,63 @@ const PARTS: [Part; 22] = [
     part([-0.037, -0.016, 0.006], [0.012, 0.011, 0.006], 0.0, 0.0, FurBand::Dark),
 ];
 
+/// Share of the light at a point of the toy, with the normal there and a number of its own.
+pub(crate) type Light<'a> = &'a dyn Fn(&Point3<f64>, &Vector3<f64>, u64) -> f64;
+
+/// The parts that stand in the light's way: centres and half axes.
+pub(crate) fn ellipsoids() -> impl Iterator<Item = (Point3<f64>, [Vector3<f64>; 3])> {
+    PARTS.iter().map(|part| (part.center(), part.half_axes()))
+}
+
+/// A sphere around the toy: centre and radius, metres.
+pub(crate) fn bounds() -> (Point3<f64>, f64) {
+    (Point3::new(0.02, 0.0, 0.085), 0.115)
+}
+
 /// The smooth body under the fur.
-pub(crate) fn body() -> Mesh {
+pub(crate) fn body(light: Light<'_>) -> Mesh {
     let mut mesh = Mesh::default();
     for part in &PARTS {
         let [tip, root] = part.band.rows();
         // Skin has the colour of the roots where hair grows, else the whole band's.
-        let top = if part.n_hairs > 0 { 0.5 * (tip + root) } else { tip };
-        mesh.add_ellipsoid(part.center(), part.half_axes(), 10, [0.0, top, 1.0, root]);
+        let texture_y = if part.n_hairs > 0 { 0.3 * tip + 0.7 * root } else { 0.5 * (tip + root) };
+        let texture_x = |point: &Point3<f64>, normal: &Vector3<f64>| {
+            // Patches as small as tufts, so that skin between hairs does not look bare.
+            let tuft = Random::new(0x70f7, &[point.x.to_bits(), point.z.to_bits()]).between(0, 0.45, 0.9);
+            texture_x(tuft * light(point, normal, 0))
+        };
+        mesh.add_ellipsoid(part.center(), part.half_axes(), 10, texture_x, texture_y);
     }
     mesh
 }
 
+/// Where the fur texture has a brightness.
+fn texture_x(brightness: f64) -> f64 {
+    ((brightness - FUR_DARKEST) / (1.0 - FUR_DARKEST)).clamp(0.0, 1.0)
+}
+
 /// All hairs: coat, mane, forelock and tail.
-pub(crate) fn fur() -> Mesh {
+pub(crate) fn fur(light: Light<'_>) -> Mesh {
     let mut mesh = Mesh::default();
     for (ix, part) in PARTS.iter().enumerate() {
         let random = Random::new(0xf0_44, &[ix as u64]);
         let half_axes = part.half_axes();
-        for hair in 0..part.n_hairs {
-            let direction = sphere_direction(
-                random.unit(8 * hair).mul_add(-2.0, 1.0).acos() / std::f64::consts::PI,
-                random.unit(8 * hair + 1),
-            );
+        for hair in 0..DENSITY * part.n_hairs / 2 {
+            let down = (1.0 - 2.0 * random.unit(8 * hair)).acos() / std::f64::consts::PI;
+            let direction = sphere_direction(down, random.unit(8 * hair + 1));
             let root =
                 part.center() + half_axes[0] * direction.x + half_axes[1] * direction.y + half_axes[2] * direction.z;
             if is_inside_another(&root, ix) {
                 continue;
             }
-            let length_m = part.hair_m * random.between(8 * hair + 2, 0.6, 1.25);
-            grow(
-                &mut mesh,
-                random,
-                8 * hair + 3,
-                &Hair {
-                    root,
-                    normal: ellipsoid_normal(&half_axes, &direction),
-                    length_m,
-                    width_m: 0.0011,
-                    band: part.band,
-                },
-            );
+            let normal = ellipsoid_normal(&half_axes, &direction);
+            let length_m = part.hair_m * random.between(8 * hair + 2, 0.8, 1.5);
+            let hair_at = Hair { root, normal, length_m, width_m: 0.0011, band: part.band };
+            grow(&mut mesh, light, random, 8 * hair + 3, &hair_at);
         }
     }
-    add_mane(&mut mesh);
-    add_tail(&mut mesh);
+    add_mane(&mut mesh, light);
+    add_tail(&mut mesh, light);
     mesh
 }
 
@@ -139,20 +154,21 @@ struct Hair {
 }
 
 /// Adds a tapered hair of two pieces that leans back and droops; it uses five counters.
-fn grow(mesh: &mut Mesh, random: Random, counter: u64, hair: &Hair) {
+fn grow(mesh: &mut Mesh, light: Light<'_>, random: Random, counter: u64, hair: &Hair) {
     let jitter = Vector3::new(
         random.between(counter, -0.45, 0.45),
         random.between(counter + 1, -0.45, 0.45),
         random.between(counter + 2, -0.45, 0.45),
     );
     let combed = Vector3::new(-0.55, 0.0, -0.25);
-    let start = (hair.normal + combed * 0.6 + jitter).normalize();
-    let end = (start + combed * 0.7 + Vector3::new(0.0, 0.0, -0.35)).normalize();
+    let start = (hair.normal * 0.9 + combed * 0.8 + jitter).normalize();
+    let end = (start + combed * 0.9 + Vector3::new(0.0, 0.0, -0.35)).normalize();
     let middle = hair.root + start * (0.55 * hair.length_m);
     let tip = middle + end * (0.45 * hair.length_m);
     let side = start.cross(&Vector3::new(0.3, 0.2, 0.9)).normalize();
     let across = start.cross(&side);
-    let tone = random.unit(counter + 3);
+    let share = light(&(hair.root + hair.normal * (0.6 * hair.length_m)), &hair.normal, counter);
+    let tone = texture_x(share * random.between(counter + 3, 0.45, 1.0));
     let [band_tip, band_root] = hair.band.rows();
     let corners = [0.0, 1.0, 2.0].map(|third: f64| {
         let (sin, cos) = (third / 3.0 * std::f64::consts::TAU).sin_cos();
@@ -181,7 +197,7 @@ fn grow(mesh: &mut Mesh, random: Random, counter: u64, hair: &Hair) {
     }
 }
 
-fn add_mane(mesh: &mut Mesh) {
+fn add_mane(mesh: &mut Mesh, light: Light<'_>) {
     let random = Random::new(0xf0_44, &[100]);
     let line = [
         Point3::new(0.020, 0.0, 0.093),
@@ -197,11 +213,11 @@ fn add_mane(mesh: &mut Mesh) {
         let normal = Vector3::new(-0.35, 60.0 * aside, 0.9).normalize();
         let length_m = random.between(9 * hair + 2, 0.012, 0.022);
         let root = root + Vector3::new(0.0, aside, -0.004);
-        grow(mesh, random, 9 * hair + 3, &Hair { root, normal, length_m, width_m: 0.0013, band: FurBand::Dark });
+        grow(mesh, light, random, 9 * hair + 3, &Hair { root, normal, length_m, width_m: 0.0013, band: FurBand::Dark });
     }
 }
 
-fn add_tail(mesh: &mut Mesh) {
+fn add_tail(mesh: &mut Mesh, light: Light<'_>) {
     let random = Random::new(0xf0_44, &[101]);
     for hair in 0..160 {
         let along = random.unit(9 * hair);
@@ -209,6 +225,6 @@ fn add_tail(mesh: &mut Mesh) {
             Point3::new(-0.046 - 0.020 * along, random.between(9 * hair + 1, -0.003, 0.003), 0.075 - 0.030 * along);
         let normal = Vector3::new(-0.5, 0.0, -0.8).normalize();
         let length_m = 0.012 + 0.016 * along;
-        grow(mesh, random, 9 * hair + 3, &Hair { root, normal, length_m, width_m: 0.0013, band: FurBand::Dark });
+        grow(mesh, light, random, 9 * hair + 3, &Hair { root, normal, length_m, width_m: 0.0013, band: FurBand::Dark });
     }
 }

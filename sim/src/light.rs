@@ -1,0 +1,208 @@
+//! The scene's light, and how much of it reaches a point: worked out once and painted into the textures.
+//!
+//! Nothing in front of a wrist camera moves, so shadows can be drawn before instead of with every picture. That halves
+//! the time of a picture, and gives the lamp an extent: its shadows are soft, and corners get less of the ambient light.
+
+use crate::random::Random;
+use kinematics::Transform;
+use nalgebra::{Matrix3, Point3, Vector3};
+use std::fmt::Write as _;
+
+/// A lamp at infinity.
+pub(crate) struct Lamp {
+    /// From the lamp to the scene.
+    direction: [f64; 3],
+    diffuse: [f64; 3],
+    specular: f64,
+}
+
+/// The lamp that casts shadows.
+const KEY: Lamp = Lamp { direction: [0.42, 0.30, -0.86], diffuse: [0.86, 0.84, 0.78], specular: 0.3 };
+/// Lamps that only fill.
+const FILLS: [Lamp; 2] = [
+    Lamp { direction: [0.55, -0.6, -0.45], diffuse: [0.20, 0.21, 0.24], specular: 0.0 },
+    Lamp { direction: [-0.4, 0.1, -0.5], diffuse: [0.10, 0.10, 0.10], specular: 0.0 },
+];
+/// Light from everywhere, sRGB 0 to 1.
+const AMBIENT: [f64; 3] = [0.37, 0.37, 0.39];
+
+/// Half the angle that the key lamp covers, as a tangent.
+const KEY_SIZE: f64 = 0.06;
+/// Rays to the key lamp, and rays to everywhere.
+const N_KEY_RAYS: u64 = 12;
+const N_AMBIENT_RAYS: u64 = 20;
+/// What is further away takes no ambient light, metres.
+const AMBIENT_REACH_M: f64 = 0.25;
+
+impl Lamp {
+    fn towards(&self) -> Vector3<f64> {
+        -Vector3::from(self.direction).normalize()
+    }
+
+    fn brightness(&self, normal: &Vector3<f64>) -> f64 {
+        self.diffuse[1] * normal.dot(&self.towards()).max(0.0)
+    }
+}
+
+/// The lamps and the ambient light as MJCF: elements of the world body, and of the visual settings.
+pub(crate) fn mjcf() -> (String, String) {
+    let list = |numbers: [f64; 3]| numbers.map(|number| number.to_string()).join(" ");
+    let mut lamps = String::new();
+    for lamp in [&KEY].into_iter().chain(&FILLS) {
+        let _ = writeln!(
+            lamps,
+            "<light directional=\"true\" pos=\"0.7 0 2\" dir=\"{}\" diffuse=\"{}\" specular=\"{}\" castshadow=\"false\"/>",
+            list(lamp.direction),
+            list(lamp.diffuse),
+            list([lamp.specular; 3])
+        );
+    }
+    let ambient = format!("<headlight ambient=\"{}\" diffuse=\"0 0 0\" specular=\"0 0 0\"/>", list(AMBIENT));
+    (lamps, ambient)
+}
+
+/// What stands in the light's way.
+pub(crate) struct Blockers {
+    /// Boxes: pose of the centre inverted, and half sizes.
+    boxes: Vec<(Transform, Vector3<f64>)>,
+    ellipsoids: Vec<Ellipsoid>,
+    /// Sphere around all ellipsoids.
+    bounds: (Point3<f64>, f64),
+}
+
+struct Ellipsoid {
+    center: Point3<f64>,
+    /// Makes the ellipsoid a unit sphere.
+    sphere_from_offset: Matrix3<f64>,
+}
+
+impl Blockers {
+    pub(crate) fn new() -> Self {
+        Self { boxes: Vec::new(), ellipsoids: Vec::new(), bounds: (Point3::origin(), 0.0) }
+    }
+
+    pub(crate) fn add_box(&mut self, world_from_box: Transform, half_m: [f64; 3]) {
+        self.boxes.push((world_from_box.inverse(), Vector3::from(half_m)));
+    }
+
+    /// Adds ellipsoids by centre and half axes that lie inside a sphere.
+    pub(crate) fn add_ellipsoids(
+        &mut self,
+        ellipsoids: impl Iterator<Item = (Point3<f64>, [Vector3<f64>; 3])>,
+        bounds: (Point3<f64>, f64),
+    ) {
+        self.ellipsoids.extend(ellipsoids.map(|(center, half_axes)| {
+            let rows = half_axes.map(|axis| (axis / axis.norm_squared()).transpose());
+            Ellipsoid { center, sphere_from_offset: Matrix3::from_rows(&rows) }
+        }));
+        self.bounds = bounds;
+    }
+
+    fn blocks(&self, from: &Point3<f64>, direction: &Vector3<f64>, reach_m: f64) -> bool {
+        let hits_box = |(box_from_world, half_m): &(Transform, Vector3<f64>)| {
+            hits_box(&(box_from_world * from).coords, &(box_from_world * direction), half_m, reach_m)
+        };
+        if self.boxes.iter().any(hits_box) {
+            return true;
+        }
+        let (center, radius_m) = self.bounds;
+        hits_sphere(&((from - center) / radius_m), &(direction / radius_m), reach_m)
+            && self.ellipsoids.iter().any(|ellipsoid| {
+                let offset = ellipsoid.sphere_from_offset * (from - ellipsoid.center);
+                hits_sphere(&offset, &(ellipsoid.sphere_from_offset * direction), reach_m)
+            })
+    }
+
+    /// Share of the light that a surface gets of what it would get if nothing stood in the way, 0 to 1.
+    ///
+    /// `name` tells points apart, for their own random rays.
+    pub(crate) fn light_share(&self, point: &Point3<f64>, normal: &Vector3<f64>, name: u64) -> f64 {
+        const LIFT_M: f64 = 5e-4;
+        let random = Random::new(0x11_6874, &[name]);
+        let from = point + normal * LIFT_M;
+        let key = KEY.brightness(normal);
+        let others = AMBIENT[1] + FILLS.iter().map(|lamp| lamp.brightness(normal)).sum::<f64>();
+        let key_share = if key > 0.0 { self.key_share(&from, random) } else { 0.0 };
+        let other_share = self.ambient_share(&from, normal, random);
+        (key * key_share + others * other_share) / (key + others)
+    }
+
+    fn key_share(&self, from: &Point3<f64>, random: Random) -> f64 {
+        let towards = KEY.towards();
+        let side = towards.cross(&Vector3::x()).normalize();
+        let across = towards.cross(&side);
+        let n_free = (0..N_KEY_RAYS).filter(|ray| {
+            // Spread evenly over the lamp's disc, turned by chance (Vogel 1979).
+            let radius = KEY_SIZE * ((*ray as f64 + 0.5) / N_KEY_RAYS as f64).sqrt();
+            let (sin, cos) = (*ray as f64 * 2.399_963 + random.between(0, 0.0, std::f64::consts::TAU)).sin_cos();
+            let direction = (towards + side * (radius * cos) + across * (radius * sin)).normalize();
+            !self.blocks(from, &direction, 10.0)
+        });
+        n_free.count() as f64 / N_KEY_RAYS as f64
+    }
+
+    fn ambient_share(&self, from: &Point3<f64>, normal: &Vector3<f64>, random: Random) -> f64 {
+        let side =
+            if normal.x.abs() < 0.7 { normal.cross(&Vector3::x()) } else { normal.cross(&Vector3::y()) }.normalize();
+        let across = normal.cross(&side);
+        let n_free = (0..N_AMBIENT_RAYS).filter(|ray| {
+            // Directions as likely as their cosine to the normal.
+            let square = (*ray as f64 + random.unit(2 + ray)) / N_AMBIENT_RAYS as f64;
+            let (sin, cos) = (*ray as f64 * 2.399_963 + random.between(1, 0.0, std::f64::consts::TAU)).sin_cos();
+            let direction = normal * (1.0 - square).sqrt() + (side * cos + across * sin) * square.sqrt();
+            !self.blocks(from, &direction, AMBIENT_REACH_M)
+        });
+        n_free.count() as f64 / N_AMBIENT_RAYS as f64
+    }
+}
+
+/// Whether a ray meets the unit sphere, or starts inside, before `reach`.
+fn hits_sphere(from: &Vector3<f64>, direction: &Vector3<f64>, reach: f64) -> bool {
+    let (a, b, c) = (direction.norm_squared(), from.dot(direction), from.norm_squared() - 1.0);
+    let inside = b * b - a * c;
+    if inside < 0.0 {
+        return false;
+    }
+    let root = inside.sqrt();
+    // Leaving the sphere after the start, entering it before the reach.
+    -b + root > 0.0 && -b - root < reach * a
+}
+
+/// Whether a ray meets a box between its start and `reach`.
+fn hits_box(from: &Vector3<f64>, direction: &Vector3<f64>, half_m: &Vector3<f64>, reach: f64) -> bool {
+    let (mut enter, mut leave) = (0.0_f64, reach);
+    for axis in 0..3 {
+        let inverse = 1.0 / direction[axis];
+        let (a, b) = ((-half_m[axis] - from[axis]) * inverse, (half_m[axis] - from[axis]) * inverse);
+        enter = enter.max(a.min(b));
+        leave = leave.min(a.max(b));
+    }
+    enter < leave
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_box_darkens_the_side_away_from_the_lamp_and_the_corner_below_it() {
+        let mut blockers = Blockers::new();
+        blockers.add_box(Transform::translation(0.0, 0.0, 0.05), [0.05; 3]);
+        let up = Vector3::z();
+        let share = |x: f64, y: f64| blockers.light_share(&Point3::new(x, y, 0.0), &up, 1);
+        assert!(share(0.5, 0.5) > 0.99, "far away: {}", share(0.5, 0.5));
+        assert!(share(0.055, 0.0) < 0.5, "in the shadow: {}", share(0.055, 0.0));
+        let before = share(-0.055, 0.0);
+        assert!(before > 0.6 && before < 0.95, "in the lit corner: {before}");
+    }
+
+    #[test]
+    fn rays_meet_ellipsoids_where_they_are() {
+        let mut blockers = Blockers::new();
+        let axes = [Vector3::x() * 0.2, Vector3::y() * 0.1, Vector3::z() * 0.1];
+        blockers.add_ellipsoids([(Point3::new(1.0, 0.0, 0.0), axes)].into_iter(), (Point3::new(1.0, 0.0, 0.0), 0.2));
+        let hits = |y: f64, reach: f64| blockers.blocks(&Point3::new(0.0, y, 0.0), &Vector3::x(), reach);
+        assert!(hits(0.09, 2.0) && !hits(0.11, 2.0) && !hits(0.0, 0.79) && hits(0.0, 0.81));
+        assert!(!blockers.blocks(&Point3::origin(), &-Vector3::x(), 2.0));
+    }
+}

@@ -1,0 +1,181 @@
+//! What stands in the static-arm scene: meshes, textures with the light painted in, and where everything is.
+
+use crate::light::Blockers;
+use crate::mesh::{Mesh, WHOLE};
+use crate::texture::{self, Texture};
+use crate::toy;
+use kinematics::Transform;
+use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
+
+/// Height of the table top above the robot's base, metres.
+pub const TABLE_Z_M: f64 = 0.12;
+/// Middle of the target area on the table, metres.
+pub const TARGET_XY_M: [f64; 2] = [0.70, 0.0];
+/// Half the side of the tag cube, metres.
+pub const CUBE_HALF_M: f64 = 0.03;
+/// Half sizes of the wooden block, metres.
+pub const BLOCK_HALF_M: [f64; 3] = [0.045, 0.02, 0.025];
+
+/// Half sizes of the table's top along x and y, and its nearest x, metres.
+const TABLE_HALF_XY_M: [f64; 2] = [0.40, 0.50];
+const TABLE_FRONT_X_M: f64 = 0.36;
+const TABLE_HALF_THICKNESS_M: f64 = 0.02;
+/// Half width and half height of a wall, metres.
+const WALL_HALF_M: [f64; 2] = [0.50, 0.50];
+/// The corner where the walls meet, metres.
+const CORNER_XY_M: [f64; 2] = [1.12, 0.0];
+
+fn on_table(x_m: f64, y_m: f64, above_m: f64, yaw_degrees: f64) -> Transform {
+    Transform::from_parts(
+        Translation3::new(TARGET_XY_M[0] + x_m, TARGET_XY_M[1] + y_m, TABLE_Z_M + above_m),
+        UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_degrees.to_radians()),
+    )
+}
+
+/// Pose of the tag cube's centre. Its sides +x, -x, +y, -y, +z, -z carry the tags 0 to 5.
+pub fn world_from_cube() -> Transform {
+    on_table(-0.035, 0.062, CUBE_HALF_M, 28.0)
+}
+
+/// Pose of the wooden block's centre.
+pub fn world_from_block() -> Transform {
+    on_table(-0.045, -0.058, BLOCK_HALF_M[2], -35.0)
+}
+
+fn world_from_toy() -> Transform {
+    on_table(0.045, -0.005, 0.0, 205.0)
+}
+
+fn table_center() -> Point3<f64> {
+    Point3::new(TABLE_FRONT_X_M + TABLE_HALF_XY_M[0], 0.0, TABLE_Z_M)
+}
+
+/// The wall on the side of +y (1) or -y (-1): x outward to the room, z up. Both run back from the corner at 45 degrees.
+fn world_from_wall(side: f64) -> Transform {
+    let half = WALL_HALF_M[0] * std::f64::consts::FRAC_1_SQRT_2;
+    let center = Translation3::new(CORNER_XY_M[0] - half, CORNER_XY_M[1] + side * half, TABLE_Z_M + WALL_HALF_M[1]);
+    Transform::from_parts(center, UnitQuaternion::from_axis_angle(&Vector3::z_axis(), -side * 135f64.to_radians()))
+}
+
+/// A mesh with the name of its texture or plain material.
+pub(crate) struct Object {
+    pub(crate) name: &'static str,
+    pub(crate) material: &'static str,
+    pub(crate) mesh: Mesh,
+    pub(crate) world_from_mesh: Transform,
+}
+
+/// Everything but the arm.
+pub(crate) fn objects() -> Vec<Object> {
+    let object = |name, material, mesh, world_from_mesh| Object { name, material, mesh, world_from_mesh };
+    let blockers = blockers();
+    let toy_light = |point: &Point3<f64>, normal: &Vector3<f64>, name: u64| {
+        blockers.light_share(&(world_from_toy() * point), &(world_from_toy() * normal), name)
+    };
+    let sides: [_; 6] = std::array::from_fn(texture::side_rectangle);
+    let here = Transform::identity();
+    vec![
+        object("cube", "tags", Mesh::cuboid([CUBE_HALF_M; 3], &sides), world_from_cube()),
+        object("block", "wood", Mesh::cuboid(BLOCK_HALF_M, &sides), world_from_block()),
+        object("toy_body", "fur", toy::body(&toy_light), world_from_toy()),
+        object("toy_fur", "fur", toy::fur(&toy_light), world_from_toy()),
+        object("table_top", "metal", table_top(), here),
+        object("brick_wall", "brick", wall(), world_from_wall(1.0)),
+        object("plaster_wall", "plaster", wall(), world_from_wall(-1.0)),
+        object("floor", "concrete", floor(), here),
+        object("frame", "frame", frame(), here),
+    ]
+}
+
+/// The textures by name, light included.
+pub(crate) fn textures() -> [(&'static str, Texture); 7] {
+    let blockers = blockers();
+    let [mut brick, mut plaster] = [texture::brick_wall(), texture::plaster_wall()];
+    for (wall, side) in [(&mut brick, 1.0), (&mut plaster, -1.0)] {
+        let world_from_wall = world_from_wall(side);
+        wall.shade(WHOLE, 160, |u, v, name| {
+            let point = Point3::new(0.0, (2.0 * u - 1.0) * WALL_HALF_M[0], (1.0 - 2.0 * v) * WALL_HALF_M[1]);
+            blockers.light_share(&(world_from_wall * point), &(world_from_wall * Vector3::x()), name)
+        });
+    }
+    let mut metal = texture::metal_table([2.0 * TABLE_HALF_XY_M[1], 2.0 * TABLE_HALF_XY_M[0]]);
+    metal.shade(WHOLE, 400, |u, v, name| {
+        let right_up = Vector3::new((1.0 - 2.0 * v) * TABLE_HALF_XY_M[0], (1.0 - 2.0 * u) * TABLE_HALF_XY_M[1], 0.0);
+        blockers.light_share(&(table_center() + right_up), &Vector3::z(), name)
+    });
+    let [mut wood, mut tags] = [texture::wood(), texture::tags()];
+    shade_box(&mut wood, &blockers, BLOCK_HALF_M, &world_from_block());
+    shade_box(&mut tags, &blockers, [CUBE_HALF_M; 3], &world_from_cube());
+    [
+        ("brick", brick),
+        ("plaster", plaster),
+        ("metal", metal),
+        ("wood", wood),
+        ("fur", texture::fur()),
+        ("tags", tags),
+        ("concrete", texture::concrete()),
+    ]
+}
+
+fn shade_box(texture: &mut Texture, blockers: &Blockers, half_m: [f64; 3], world_from_box: &Transform) {
+    for side in 0..6 {
+        texture.shade(texture::side_rectangle(side), 40, |u, v, name| {
+            let (point, normal) = Mesh::on_cuboid(half_m, side, u, v);
+            blockers.light_share(&(world_from_box * point), &(world_from_box * normal), name)
+        });
+    }
+}
+
+fn blockers() -> Blockers {
+    const WALL_HALF_THICKNESS_M: f64 = 0.005;
+    let mut blockers = Blockers::new();
+    blockers.add_box(world_from_cube(), [CUBE_HALF_M; 3]);
+    blockers.add_box(world_from_block(), BLOCK_HALF_M);
+    let table = table_center() - Vector3::new(0.0, 0.0, TABLE_HALF_THICKNESS_M);
+    let [half_x, half_y] = TABLE_HALF_XY_M;
+    blockers.add_box(Translation3::from(table.coords).into(), [half_x, half_y, TABLE_HALF_THICKNESS_M]);
+    for side in [1.0, -1.0] {
+        let world_from_box = world_from_wall(side) * Translation3::new(-WALL_HALF_THICKNESS_M, 0.0, 0.0);
+        blockers.add_box(world_from_box, [WALL_HALF_THICKNESS_M, WALL_HALF_M[0], WALL_HALF_M[1]]);
+    }
+    let world_from_toy = world_from_toy();
+    let (center, radius_m) = toy::bounds();
+    let ellipsoids = toy::ellipsoids()
+        .map(|(center, half_axes)| (world_from_toy * center, half_axes.map(|axis| world_from_toy * axis)));
+    blockers.add_ellipsoids(ellipsoids, (world_from_toy * center, radius_m));
+    blockers
+}
+
+fn table_top() -> Mesh {
+    let mut mesh = Mesh::default();
+    mesh.rectangle(table_center(), Vector3::y() * -TABLE_HALF_XY_M[1], Vector3::x() * TABLE_HALF_XY_M[0], WHOLE);
+    mesh
+}
+
+fn wall() -> Mesh {
+    let (right, up) = (Vector3::y() * WALL_HALF_M[0], Vector3::z() * WALL_HALF_M[1]);
+    let mut mesh = Mesh::default();
+    mesh.rectangle(Point3::origin(), right, up, WHOLE);
+    mesh.rectangle(Point3::new(-0.01, 0.0, 0.0), -right, up, WHOLE);
+    mesh
+}
+
+fn floor() -> Mesh {
+    let mut mesh = Mesh::default();
+    mesh.rectangle(Point3::new(0.5, 0.0, -0.75), Vector3::x() * 3.0, Vector3::y() * 3.0, [0.0, 0.0, 4.0, 4.0]);
+    mesh
+}
+
+/// The robot's pedestal, and the table's edge and legs.
+fn frame() -> Mesh {
+    let mut mesh = Mesh::default();
+    mesh.append(Mesh::cuboid([0.15, 0.15, 0.36], &[WHOLE; 6]), Vector3::new(-0.02, 0.0, -0.365));
+    let slab = Mesh::cuboid([TABLE_HALF_XY_M[0], TABLE_HALF_XY_M[1], TABLE_HALF_THICKNESS_M], &[WHOLE; 6]);
+    // A hair's breadth below the top, so that the two do not flicker.
+    mesh.append(slab, table_center().coords - Vector3::new(0.0, 0.0, TABLE_HALF_THICKNESS_M + 1e-4));
+    for (x, y) in [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)] {
+        let corner = table_center() + Vector3::new(x * 0.36, y * 0.42, -0.45);
+        mesh.append(Mesh::cuboid([0.02, 0.02, 0.41], &[WHOLE; 6]), corner.coords);
+    }
+    mesh
+}

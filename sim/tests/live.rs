@@ -1,0 +1,47 @@
+//! The simulated rig as live devices.
+
+use drivers::PixelFormat;
+use kinematics::Stamp;
+use sim::Config;
+use std::time::Duration;
+
+#[test]
+fn devices_deliver_stamped_samples_until_the_rig_ends() {
+    const PATIENCE: Duration = Duration::from_secs(60);
+    const START: Stamp = Stamp(5_000_000_000_000);
+    let mut config = Config { duration_secs: Some(1.0), ..Config::default() };
+    config.cameras[0].intrinsics = config.cameras[0].intrinsics.resized([160, 120]);
+    let mut rig = sim::open(&config).expect("the rig opens").into_live(START).expect("the rig starts");
+
+    let mut newest = START;
+    let mut n_readings = 0;
+    while let Ok(state) = rig.arm.read(PATIENCE) {
+        assert!(n_readings == 0 || state.stamp > newest);
+        assert_eq!((state.position.len(), state.velocity.len()), (7, 7));
+        newest = state.stamp;
+        n_readings += 1;
+    }
+    // One second at 1 kHz; only a machine that stands still for a second loses some.
+    assert!((500..=1001).contains(&n_readings), "{n_readings} readings");
+    assert!(newest > START && newest <= START.plus_secs(1.001));
+
+    let camera = &mut rig.cameras[0];
+    assert_eq!(camera.name(), "wrist");
+    let (mut n_color, mut n_depth, mut n_lost) = (0, 0, 0);
+    let end = loop {
+        match camera.next_image(PATIENCE) {
+            Ok(image) if image.format == PixelFormat::Rgb8 => {
+                n_color += 1;
+                n_lost += image.n_skipped;
+            }
+            Ok(_) => n_depth += 1,
+            Err(error) => break error,
+        }
+    };
+    assert!(matches!(end, drivers::Error::Simulation { .. }), "{end}");
+    assert!(n_color >= 1 && n_depth >= 1, "{n_color} colour, {n_depth} depth");
+    // Nobody took images while the joints were read: what did not fit the queue was counted.
+    assert!(n_color + n_lost <= 15 && n_color + n_depth <= 8, "{n_color} colour, {n_depth} depth, {n_lost} lost");
+    let truth = rig.truth.take().expect("truth came along");
+    assert!(truth.psnr_ceiling.is_some());
+}
