@@ -286,7 +286,7 @@ fn join(mut keys: Section<'_>) -> JoinConfig {
         min_rotation_rad: keys.number("min_rotation_rad", 1e-6..=3.2).unwrap_or(0.05),
         fixed_interval_millis: keys.number("fixed_interval_millis", 0.0..=1e9).unwrap_or(1000.0),
         fixed_keyframes: keys.whole("fixed_keyframes", 1..=1_000_000).map_or(16, count),
-        min_sharpness_frac: keys.number("min_sharpness_frac", 0.0..=1.0).unwrap_or(0.4),
+        min_sharpness_frac: keys.number("min_sharpness_frac", 0.0..=1.0).unwrap_or(0.35),
         max_blur_px: keys.number("max_blur_px", 0.0..=1000.0).unwrap_or(1.5),
         max_shear_px: keys.number("max_shear_px", 0.0..=1000.0).unwrap_or(40.0),
         min_luma_frac: keys.number("min_luma_frac", 0.0..=1.0).unwrap_or(0.03),

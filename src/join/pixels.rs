@@ -2,8 +2,8 @@
 
 /// The reduced image is about this wide, so that sharpness means the same for every camera and noise averages out.
 const REDUCED_WIDTH: usize = 320;
-/// Sharpness is compared with the median of this many images before.
-const MEMORY: usize = 31;
+/// Sharpness is compared with the median of this many images: few enough that they show much the same.
+const MEMORY: usize = 9;
 /// Brightness at and beyond which a pixel is clipped, of 255.
 const CLIPPED: [u8; 2] = [1, 254];
 
@@ -14,7 +14,8 @@ pub(super) struct PixelFacts {
     pub(super) luma_frac: f64,
     /// Share of the pixels that are black or white.
     pub(super) clipped_frac: f64,
-    /// Variance of the Laplacian of the reduced image; only its ratio to other images of the same camera means something.
+    /// Variance of the Laplacian of the reduced image, relative to the variance of the image itself, so that a change of
+    /// contrast is no change of sharpness; only its ratio to other images of the same camera means something.
     pub(super) sharpness: f64,
 }
 
@@ -29,7 +30,7 @@ impl PixelFacts {
         Self {
             luma_frac: share(reduced.luma_sum) / 255.0,
             clipped_frac: share(reduced.n_clipped),
-            sharpness: reduced.laplacian_variance(),
+            sharpness: reduced.sharpness(),
         }
     }
 }
@@ -68,20 +69,38 @@ impl Reduced {
         reduced
     }
 
-    fn laplacian_variance(&self) -> f64 {
+    fn sharpness(&self) -> f64 {
         let [width, height] = self.size;
-        let (mut n, mut sum, mut sum_of_squares) = (0.0, 0.0, 0.0);
+        let (mut luma, mut laplacian) = (Variance::default(), Variance::default());
         for row in 1..height.saturating_sub(1) {
             for column in 1..width.saturating_sub(1) {
                 let at = row * width + column;
                 let around = self.luma[at - 1] + self.luma[at + 1] + self.luma[at - width] + self.luma[at + width];
-                let laplacian = around - 4.0 * self.luma[at];
-                n += 1.0;
-                sum += laplacian;
-                sum_of_squares += laplacian * laplacian;
+                laplacian.add(around - 4.0 * self.luma[at]);
+                luma.add(self.luma[at]);
             }
         }
-        if n == 0.0 { 0.0 } else { sum_of_squares / n - (sum / n) * (sum / n) }
+        if luma.get() > 0.0 { laplacian.get() / luma.get() } else { 0.0 }
+    }
+}
+
+/// A running variance.
+#[derive(Clone, Copy, Debug, Default)]
+struct Variance {
+    n: f64,
+    sum: f64,
+    sum_of_squares: f64,
+}
+
+impl Variance {
+    fn add(&mut self, value: f64) {
+        self.n += 1.0;
+        self.sum += value;
+        self.sum_of_squares += value * value;
+    }
+
+    fn get(&self) -> f64 {
+        if self.n == 0.0 { 0.0 } else { self.sum_of_squares / self.n - (self.sum / self.n) * (self.sum / self.n) }
     }
 }
 
@@ -122,7 +141,8 @@ mod tests {
     #[test]
     fn blur_lowers_sharpness_and_leaves_brightness() {
         for size_px in [[160, 120], [640, 480], [1280, 720]] {
-            let facts = [0, 8, 24].map(|blur| PixelFacts::of(&stripes(size_px, 32, blur * size_px[0] / 640), size_px));
+            let facts = [0, 8, 24]
+                .map(|blur| PixelFacts::of(&stripes(size_px, size_px[0] / 10, blur * size_px[0] / 640), size_px));
             assert!(
                 facts[0].sharpness >= facts[1].sharpness && facts[1].sharpness > 1.3 * facts[2].sharpness,
                 "{size_px:?}: {facts:?}"
@@ -135,13 +155,21 @@ mod tests {
     }
 
     #[test]
+    fn contrast_is_no_sharpness() {
+        let strong = stripes([640, 480], 32, 8);
+        let weak: Vec<u8> = strong.iter().map(|level| 100 + level / 4).collect();
+        let [strong, weak] = [strong, weak].map(|rgb| PixelFacts::of(&rgb, [640, 480]).sharpness);
+        assert!((strong - weak).abs() < 0.05 * strong, "{strong} {weak}");
+    }
+
+    #[test]
     fn clipped_pixels_are_counted_and_flat_images_have_no_sharpness() {
         let mut rgb = vec![255; 30 * 20 * 3];
         rgb[..30 * 5 * 3].fill(0);
         rgb[30 * 5 * 3..30 * 10 * 3].fill(128);
         let facts = PixelFacts::of(&rgb, [30, 20]);
         assert!((facts.clipped_frac - 0.75).abs() < 1e-12, "{facts:?}");
-        assert_eq!(PixelFacts::of(&[77; 8 * 8 * 3], [8, 8]).sharpness, 0.0);
+        assert_eq!(PixelFacts::of(&[77; 8 * 8 * 3], [8, 8]).sharpness, 0.0, "flat");
         assert_eq!(PixelFacts::of(&[77; 3], [1, 1]).sharpness, 0.0, "too small for a Laplacian");
     }
 
