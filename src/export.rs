@@ -97,11 +97,11 @@ fn write_frame(out: &Path, keyframe: &Keyframe, written: &mut Written) -> anyhow
 
 /// Size and lens of a keyframe under nerfstudio's keys.
 fn camera_keys(keyframe: &Keyframe) -> Map<String, Value> {
-    let [[width, height], [fl_x, fl_y], [cx, cy]] =
-        [keyframe.size_px.map(f64::from), keyframe.focal_px, keyframe.principal_px];
+    let [[fl_x, fl_y], [cx, cy]] = [keyframe.focal_px, keyframe.principal_px];
     let keys =
         [("fl_x", fl_x), ("fl_y", fl_y), ("cx", cx), ("cy", cy)].map(|(key, value)| (key.to_owned(), json!(value)));
-    let size = [("w", width), ("h", height)].map(|(key, value)| (key.to_owned(), json!(value as u32)));
+    let [width, height] = keyframe.size_px;
+    let size = [("w", width), ("h", height)].map(|(key, value)| (key.to_owned(), json!(value)));
     keys.into_iter().chain(size).collect()
 }
 
@@ -156,7 +156,7 @@ mod tests {
     fn keyframe(ix: usize) -> Keyframe {
         let turn = UnitQuaternion::from_euler_angles(0.1 * ix as f64, 0.2, -1.0);
         let world_from_camera = Transform::from_parts(Vector3::new(ix as f64, 2.0, 3.0).into(), turn);
-        let pixels = (0..32 * 24).flat_map(|pixel_ix: usize| [(pixel_ix % 251) as u8, ix as u8, 9, 255]);
+        let pixels = (0..24).flat_map(|y: u8| (0..32).flat_map(move |x: u8| [3 * x, y, 9, 255]));
         let depth = DepthMap {
             size_px: [16, 12],
             focal_px: [15.0, 15.5],

@@ -1,4 +1,5 @@
 //! `fieldrig metrics` and `fieldrig export` as their users run them.
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
 use image::{ExtendedColorType, RgbaImage};
 use serde_json::Value;

@@ -1,4 +1,4 @@
-//! LPIPS, the learned perceptual distance, on SqueezeNet 1.1 (version 0.1 of the weights).
+//! LPIPS, the learned perceptual distance, on `SqueezeNet` 1.1 (version 0.1 of the weights).
 
 use super::PixelPair;
 use crate::Error;
@@ -19,8 +19,8 @@ const STAGES: [&[(usize, bool)]; 6] =
 
 /// The learned perceptual distance of two pictures; 0 for equal ones.
 ///
-/// Features of seven depths of SqueezeNet 1.1, normalised per pixel, squared differences weighted per channel, mean over
-/// pixels, sum over depths. Source: Zhang, Isola, Efros, Shechtman, Wang 2018, section 3; Iandola et al. 2016.
+/// Features of seven depths of `SqueezeNet` 1.1, normalised per pixel, squared differences weighted per channel, mean
+/// over pixels, sum over depths. Source: Zhang, Isola, Efros, Shechtman, Wang 2018, section 3; Iandola et al. 2016.
 #[derive(Debug)]
 pub struct Lpips {
     first: Convolution,
@@ -30,7 +30,7 @@ pub struct Lpips {
 }
 
 impl Lpips {
-    /// Reads the weights: a safetensors file with `features.*` of SqueezeNet 1.1 and `lin0..6.weight`.
+    /// Reads the weights: a safetensors file with `features.*` of `SqueezeNet` 1.1 and `lin0..6.weight`.
     pub fn load(path: &Path) -> Result<Self, Error> {
         let bytes = std::fs::read(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
         Self::from_bytes(&bytes).map_err(|source| Error::LpipsWeights { path: path.to_owned(), source })
@@ -120,7 +120,7 @@ impl Convolution {
     }
 }
 
-/// SqueezeNet's module: few channels in the middle, then small and large windows side by side.
+/// The module of `SqueezeNet`: few channels in the middle, then small and large windows side by side.
 #[derive(Debug)]
 struct Fire {
     halve: bool,

@@ -1,4 +1,4 @@
-//! Splats in `.ply` files: the layout of Kerbl et al. 2023 in and out, the packed layout of SuperSplat in.
+//! Splats in `.ply` files: the layout of Kerbl et al. 2023 in and out, the packed layout of `SuperSplat` in.
 
 mod header;
 mod packed;

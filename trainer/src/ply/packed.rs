@@ -1,4 +1,4 @@
-//! The packed `.ply` of SuperSplat: 16 bytes a splat in chunks of 256 with common bounds, colour beyond the constant 8 bits.
+//! The packed `.ply` of `SuperSplat`: 16 bytes a splat in chunks of 256 with common bounds, colour beyond the constant 8 bits.
 
 use super::header::{Column, Header, Table};
 use super::rest_columns;
@@ -123,6 +123,7 @@ mod tests {
     use super::*;
 
     /// Packs a rotation as the format asks.
+    #[expect(clippy::cast_possible_truncation, reason = "a step of 10 bits")]
     fn packed(wxyz: [f32; 4]) -> u32 {
         let largest_ix = (0..4).max_by(|&a, &b| wxyz[a].abs().total_cmp(&wxyz[b].abs())).unwrap();
         let sign = wxyz[largest_ix].signum();
@@ -146,9 +147,9 @@ mod tests {
 
     #[test]
     fn fractions_fill_their_bits() {
-        assert_eq!(thirds(0b11111111111_0000000000_00000000000), [1.0, 0.0, 0.0]);
-        assert_eq!(thirds(0b00000000000_1111111111_00000000000), [0.0, 1.0, 0.0]);
-        assert_eq!(thirds(0b00000000000_0000000000_11111111111), [0.0, 0.0, 1.0]);
+        assert_eq!(thirds(0x7ff << 21), [1.0, 0.0, 0.0]);
+        assert_eq!(thirds(0x3ff << 11), [0.0, 1.0, 0.0]);
+        assert_eq!(thirds(0x7ff), [0.0, 0.0, 1.0]);
         assert_eq!([0.0, 255.0].map(higher_coefficient), [-4.0, 4.0]);
     }
 }

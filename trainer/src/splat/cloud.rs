@@ -57,7 +57,7 @@ fn rows<const N: usize>(file: &NpzTensors, name: &str, inner_shape: &[usize]) ->
     Ok(array.flatten_all()?.to_vec1::<f32>()?.as_chunks::<N>().0.to_vec())
 }
 
-/// A fixed random sequence. Source: Steele, Lea, Flood 2014 (SplitMix64); Box, Muller 1958.
+/// A fixed random sequence. Source: Steele, Lea, Flood 2014 (`SplitMix64`); Box, Muller 1958.
 struct Random {
     state: u64,
     /// Box and Muller make two at once.
