@@ -70,9 +70,9 @@ impl Live {
         self.session.is_over() || self.feed.broke_off()
     }
 
-    /// Keyframes held.
-    pub(crate) fn n_keyframes(&self) -> usize {
-        self.keyframes.len()
+    /// Keyframes held, in order of acceptance.
+    pub(crate) fn keyframes(&self) -> &[Arc<Keyframe>] {
+        &self.keyframes
     }
 
     /// Gives new keyframes to the model: all that wait in real time, the one that is due in lockstep.

@@ -18,7 +18,8 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
+use trainer::Keyframe;
 use trainer::gpu::Gpu;
 use viz::{Hub, Server, ServerConfig};
 
@@ -70,6 +71,9 @@ struct Particulars {
     evicted: u64,
     refused: BTreeMap<&'static str, u64>,
     device_skipped: u64,
+    /// Largest distance of a keyframe's camera from its true place, metres; in simulation only.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    worst_position_error_m: Option<f64>,
 }
 
 /// Runs until a limit, the end of the devices, or Ctrl-C; saves the model, its keyframes and the settled rig file.
@@ -111,7 +115,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
 /// Saves what there is, then tells what went wrong on the way.
 fn save(live: Live, rig: &Rig, kind: Kind, out: &Path, damage: &OnceLock<String>) -> anyhow::Result<Exit> {
-    let n_keyframes = live.n_keyframes();
+    let n_keyframes = live.keyframes().len();
+    let live_error_m = worst_position_error_m(live.keyframes());
     let (session, leftover) = live.finish();
     let leftover = leftover?;
     let counts = leftover.join.counts();
@@ -124,6 +129,7 @@ fn save(live: Live, rig: &Rig, kind: Kind, out: &Path, damage: &OnceLock<String>
         evicted: counts.evicted,
         refused: counts.refused.iter().map(|(why, n)| (why.name(), *n)).collect(),
         device_skipped: counts.device_skipped,
+        worst_position_error_m: live_error_m,
     };
     if n_keyframes > 0 {
         session.finish(out, &particulars)?;
@@ -187,6 +193,15 @@ impl Args {
             Pace::RealTime
         }
     }
+}
+
+/// How far off the worst pose is, where a simulator tells the true ones.
+fn worst_position_error_m(keyframes: &[Arc<Keyframe>]) -> Option<f64> {
+    let error_m = |keyframe: &Arc<Keyframe>| {
+        let truth = keyframe.truth.as_ref()?.world_from_camera.translation.vector;
+        Some((keyframe.world_from_camera.translation.vector - truth).norm())
+    };
+    keyframes.iter().filter_map(error_m).reduce(f64::max)
 }
 
 /// What people at the page should know.

@@ -64,7 +64,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let gpu = super::open_gpu()?;
     let (kind, options) = args.model(&data)?;
     let seed = options.seed;
-    let method = kind.start(gpu.clone(), options)?;
+    let mut method = kind.start(gpu.clone(), options)?;
+    method.prepare()?;
     let out = run_folder::make(args.out.as_deref())?;
     run_folder::write_keyframe_list(&out.join("keyframes.txt"), &data.keyframes)?;
     if let Some(rig) = &data.rig {

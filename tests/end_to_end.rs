@@ -1,0 +1,154 @@
+//! The whole program on a simulated rig: devices to keyframes to a model, recorded, replayed, scored and drawn.
+
+#![cfg(feature = "sim")]
+
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+/// Images the simulated camera delivers.
+const N_IMAGES: &str = "48";
+/// Steps of every run here.
+const N_STEPS: &str = "160";
+/// Measured 24.6 dB on this scene at this size and number of steps; less means that something broke, not that it got slower.
+const LEAST_PSNR: f64 = 22.0;
+/// Forward kinematics, interpolation and the camera's mounting together.
+const MOST_POSITION_ERROR_M: f64 = 1e-4;
+
+/// A rig file like `rigs/static-arm.toml`, a quarter of the size, without flaws.
+fn rig_file(folder: &Path) -> PathBuf {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let urdf = root.join("rigs/robots/panda.urdf");
+    std::fs::copy(&urdf, folder.join("panda.urdf")).expect("the robot's description");
+    let file = folder.join("rig.toml");
+    let text = format!(
+        r#"
+[arm]
+driver = "sim"
+urdf = "panda.urdf"
+flange_link = "panda_link8"
+
+[camera.wrist]
+driver = "sim"
+size_px = [160, 120]
+rate_hz = 15
+readout_micros = 0
+parent = "flange"
+parent_from_camera = {{ xyz_m = [0.041, 0.0, 0.063], quat_xyzw = [0.0, 0.0, 0.7071067811865476, 0.7071067811865476] }}
+intrinsics = {{ focal_px = [153.65, 153.55], principal_px = [80.925, 59.1], lens = "pinhole" }}
+
+[camera.wrist.depth]
+min_m = 0.1
+max_m = 6.0
+
+[sim]
+scene = "static-arm"
+seed = 1
+ideal = true
+lockstep = true
+n_images = {N_IMAGES}
+"#
+    );
+    std::fs::write(&file, text).expect("room on the disk");
+    file
+}
+
+fn fieldrig(folder: &Path, args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_fieldrig")).args(args).current_dir(folder).output().expect("fieldrig starts")
+}
+
+/// Runs a command that must succeed; its JSON lines come back.
+fn events(folder: &Path, args: &[&str]) -> Vec<Value> {
+    let output = fieldrig(folder, args);
+    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    let stdout = String::from_utf8(output.stdout).expect("stdout is UTF-8");
+    stdout.lines().map(|line| serde_json::from_str(line).expect("a JSON object a line")).collect()
+}
+
+fn number(value: &Value, key: &str) -> f64 {
+    value[key].as_f64().unwrap_or_else(|| panic!("no number {key:?} in {value}"))
+}
+
+#[test]
+fn a_simulated_run_learns_and_its_recording_gives_the_same_bits() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    rig_file(folder);
+    let live = ["run", "rig.toml", "--sim", "--steps", N_STEPS, "--record", "scan.mcap", "--out", "live"];
+    let replay = ["run", "rig.toml", "--from", "scan.mcap", "--steps", N_STEPS, "--out", "replay"];
+    let common = ["--listen", "127.0.0.1:0", "--json"];
+
+    let told = events(folder, &[&live[..], &common[..]].concat());
+    assert_eq!(told[0]["event"], "serving", "the address comes first");
+    let done = told.last().expect("events");
+    assert_eq!(done["event"], "done");
+    assert_eq!(done["steps"].as_u64(), N_STEPS.parse().ok());
+    let psnr = number(done, "psnr");
+    assert!(psnr >= LEAST_PSNR, "test PSNR {psnr:.2} dB");
+
+    let report = std::fs::read_to_string(folder.join("live/report.json")).expect("a report");
+    let report: Value = serde_json::from_str(&report).expect("JSON");
+    let error_m = number(&report, "worst_position_error_m");
+    assert!(error_m < MOST_POSITION_ERROR_M, "a camera is {error_m} m off");
+    assert!(number(&report, "keyframes") >= 16.0, "{report}");
+
+    let replayed = events(folder, &[&replay[..], &common[..]].concat());
+    let replayed = replayed.last().expect("events");
+    assert_eq!(replayed["checkpoint_sha256"], done["checkpoint_sha256"], "the replay gives another model");
+    for list in ["keyframes.txt", "splats.ply"] {
+        let [first, second] = ["live", "replay"].map(|run| std::fs::read(folder.join(run).join(list)).expect(list));
+        assert!(first == second, "{list} differs");
+    }
+
+    scores_a_saved_model_alike(folder, psnr);
+    draws_a_saved_model(folder);
+    tells_what_a_cut_off_recording_lost(folder);
+}
+
+/// What `run` said of its model, `eval` says of the saved one.
+fn scores_a_saved_model_alike(folder: &Path, psnr: f64) {
+    /// The file keeps the parameters' bits; scores are sums in the same order.
+    const ABS_DB: f64 = 1e-6;
+    let list = ["--keyframes", "live/keyframes.txt", "--json"];
+    let judged = events(folder, &[&["eval", "live", "scan.mcap"][..], &list[..]].concat());
+    let again = number(&judged[0], "psnr");
+    assert!((again - psnr).abs() < ABS_DB, "eval says {again} dB, run said {psnr} dB");
+    assert!(judged[0]["per_image"].as_array().is_some_and(|images| images.len() >= 2), "{}", judged[0]);
+}
+
+fn draws_a_saved_model(folder: &Path) {
+    let pose = "1 0 0 0.5  0 -1 0 0  0 0 -1 0.6  0 0 0 1"; // Above the table, looking down.
+    let drawn = events(
+        folder,
+        &["render", "live", "--pose", pose, "--size", "64x48", "--depth", "--out", "pictures", "--json"],
+    );
+    let picture = drawn[0]["picture"].as_str().expect("a picture");
+    let pixels = image::open(folder.join(picture)).expect("a PNG file").into_rgb8();
+    assert_eq!(pixels.dimensions(), (64, 48));
+    let brightest = pixels.pixels().map(|pixel| pixel.0.iter().copied().max()).max();
+    assert!(brightest > Some(Some(40)), "the picture is black");
+    assert!(folder.join(drawn[0]["depth"].as_str().expect("a depth file")).is_file());
+}
+
+/// Half a recording trains; the exit code and one sentence say that something is missing.
+fn tells_what_a_cut_off_recording_lost(folder: &Path) {
+    let whole = std::fs::read(folder.join("scan.mcap")).expect("the recording");
+    std::fs::write(folder.join("half.mcap"), &whole[..whole.len() / 2]).expect("room on the disk");
+    let output = fieldrig(folder, &["train", "half.mcap", "--steps", "1", "--out", "half", "--json"]);
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(3), "{told}");
+    assert!(told.contains("half.mcap") || told.contains("recording"), "{told}");
+    assert!(folder.join("half/splats.ply").is_file(), "what was there is used");
+}
+
+#[test]
+fn a_port_in_use_is_one_clear_sentence() {
+    let folder = tempfile::tempdir().expect("a folder");
+    rig_file(folder.path());
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
+    let address = taken.local_addr().expect("bound").to_string();
+    let output = fieldrig(folder.path(), &["run", "rig.toml", "--sim", "--listen", &address]);
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{told}");
+    assert!(told.starts_with("error: ") && told.contains(&address), "{told}");
+}
