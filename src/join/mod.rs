@@ -55,7 +55,7 @@ pub(crate) enum JoinEvent {
     /// A colour image whose pose is known, keyframe or not.
     Seen(Seen),
     /// A colour image that became no keyframe.
-    Refused { camera: Arc<str>, stamp: Stamp, why: Refusal },
+    Refused { why: Refusal },
 }
 
 /// A colour image and where it was taken.
@@ -120,7 +120,8 @@ impl Join {
                 self.counts.joints_refused += u64::from(!sensible);
             }
             Sample::Base(pose) => {
-                self.motion.push_base(&pose);
+                let sensible = self.motion.push_base(&pose);
+                self.counts.base_poses_refused += u64::from(!sensible);
             }
             Sample::Image(image) => self.push_image(image, &mut events),
             Sample::Truth(truth) => {
@@ -160,7 +161,7 @@ impl Join {
         self.counts.images += u64::from(!image.is_depth());
         let Some(camera) = self.cameras.iter_mut().find(|camera| camera.config.name == image.camera) else {
             if !image.is_depth() {
-                self.refuse(image.camera, image.stamp, Refusal::UnknownCamera, events);
+                self.refuse(&image.camera, image.stamp, Refusal::UnknownCamera, events);
             }
             return;
         };
@@ -169,7 +170,7 @@ impl Join {
             camera.waiting.push_depth(stamp, image);
         } else if let Some(crowded) = camera.waiting.push_color(image) {
             let stamp = camera.mid_exposure(crowded.stamp);
-            self.refuse(crowded.camera, stamp, Refusal::Crowded, events);
+            self.refuse(&crowded.camera, stamp, Refusal::Crowded, events);
         }
     }
 
@@ -183,7 +184,7 @@ impl Join {
                         events.push(JoinEvent::Seen(seen));
                         self.decide(camera_ix, ripe, events);
                     }
-                    Err((camera, stamp)) => self.refuse(camera, stamp, Refusal::NoPose, events),
+                    Err((camera, stamp)) => self.refuse(&camera, stamp, Refusal::NoPose, events),
                 }
             }
         }
@@ -241,7 +242,7 @@ impl Join {
         };
         let keyframe = match camera.keyframe(ripe, split, listed.is_none(), self.default_depth_m) {
             Ok(keyframe) => Arc::new(keyframe),
-            Err(why) => return self.refuse(name, stamp, why, events),
+            Err(why) => return self.refuse(&name, stamp, why, events),
         };
         camera.n_accepted += 1;
         self.counts.accepted += 1;
@@ -253,9 +254,10 @@ impl Join {
         }
     }
 
-    fn refuse(&mut self, camera: Arc<str>, stamp: Stamp, why: Refusal, events: &mut Vec<JoinEvent>) {
+    fn refuse(&mut self, camera: &str, stamp: Stamp, why: Refusal, events: &mut Vec<JoinEvent>) {
+        log::debug!("camera {camera:?}: the image at {} ns became no keyframe: {why}", stamp.0);
         self.counts.refuse(why);
-        events.push(JoinEvent::Refused { camera, stamp, why });
+        events.push(JoinEvent::Refused { why });
     }
 }
 

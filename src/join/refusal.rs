@@ -81,6 +81,8 @@ pub(crate) struct Counts {
     pub(crate) device_skipped: u64,
     /// Joint readings that were out of order, not numbers, or of another arm.
     pub(crate) joints_refused: u64,
+    /// Base poses that were out of order or not numbers.
+    pub(crate) base_poses_refused: u64,
     /// Images refused, by reason.
     pub(crate) refused: BTreeMap<Refusal, u64>,
 }
@@ -102,6 +104,7 @@ impl std::fmt::Display for Counts {
             (self.without_depth, "without depth"),
             (self.device_skipped, "lost by devices"),
             (self.joints_refused, "joint readings refused"),
+            (self.base_poses_refused, "base poses refused"),
         ];
         for (n, what) in rest {
             if n > 0 {

@@ -3,7 +3,7 @@
 use super::{Join, JoinEvent, KeyframeList, Refusal};
 use crate::config::{Override, Rig};
 use crate::open;
-use drivers::{Image, PixelFormat, Sample, TruthImage};
+use drivers::{BasePose, Image, PixelFormat, Sample, TruthImage};
 use kinematics::{Chain, JointState, Stamp, Transform};
 use std::f64::consts::TAU;
 use std::path::Path;
@@ -101,7 +101,7 @@ fn samples(secs: i64) -> Vec<Sample> {
 #[derive(Default)]
 struct Outcome {
     keyframes: Vec<Arc<Keyframe>>,
-    refused: Vec<(i64, Refusal)>,
+    refused: Vec<Refusal>,
     evicted: Vec<i64>,
     n_seen: usize,
 }
@@ -112,7 +112,7 @@ fn play(join: &mut Join, samples: impl IntoIterator<Item = Sample>) -> Outcome {
         for event in events {
             match event {
                 JoinEvent::Accepted(keyframe) => outcome.keyframes.push(keyframe),
-                JoinEvent::Refused { stamp, why, .. } => outcome.refused.push((stamp.0, why)),
+                JoinEvent::Refused { why } => outcome.refused.push(why),
                 JoinEvent::Evicted { stamp, .. } => outcome.evicted.push(stamp.0),
                 JoinEvent::Seen(_) => outcome.n_seen += 1,
             }
@@ -268,9 +268,11 @@ fn images_without_joints_wait_and_are_dropped_with_a_count() {
         samples(8).into_iter().filter(|sample| !(matches!(sample, Sample::Joints(_)) && silent(sample.stamp().0)));
     let mut join = join(&rig);
     let outcome = play(&mut join, kept);
-    let no_pose: Vec<i64> =
-        outcome.refused.iter().filter(|(_, why)| *why == Refusal::NoPose).map(|(nanos, _)| *nanos).collect();
-    assert!(no_pose.iter().all(|nanos| silent(*nanos)) && no_pose.len() == 40, "{} without a pose", no_pose.len());
+    assert_eq!(
+        outcome.refused.iter().filter(|why| **why == Refusal::NoPose).count(),
+        40,
+        "as many as came in the silence"
+    );
     assert!(outcome.keyframes.iter().all(|keyframe| !silent(keyframe.stamp.0)));
     assert_eq!(join.counts().refused[&Refusal::NoPose], 40);
     assert_eq!(join.counts().images, 80);
@@ -305,6 +307,34 @@ fn readings_that_are_no_numbers_cost_the_images_around_them() {
         effort: vec![],
     }));
     assert_eq!(short.counts().joints_refused, 1);
+}
+
+#[test]
+fn a_base_that_moves_carries_the_cameras_and_a_broken_pose_is_refused() {
+    let rig = rig(&[Override::new("base.driver", "udp"), Override::new("join.max_gap_millis", 150)]);
+    let base = |nanos: i64, x_m: f64| {
+        let world_from_base = Transform::translation(x_m, 0.0, 0.0);
+        Sample::Base(BasePose { stamp: Stamp(nanos), world_from_base })
+    };
+    // A metre per second, told at 10 Hz; one pose is no number.
+    let told = (0..41_i64).map(|tick| {
+        let secs = Stamp(tick * 100_000_000).secs();
+        base(tick * 100_000_000, if tick == 20 { f64::NAN } else { secs })
+    });
+    let mut mixed: Vec<Sample> = samples(4).into_iter().chain(told).collect();
+    mixed.sort_by_key(Sample::stamp);
+    let mut moving = join(&rig);
+    let outcome = play(&mut moving, mixed);
+    assert_eq!(moving.counts().base_poses_refused, 1);
+    assert!(outcome.keyframes.len() > 20, "{}", moving.counts());
+    let chain = Chain::from_urdf(&rig.arm.urdf_text, &rig.arm.base_link, &rig.arm.flange_link).expect("a Panda");
+    for keyframe in &outcome.keyframes {
+        let secs = keyframe.stamp.secs();
+        assert!((secs - 2.0).abs() > 0.1, "no pose around the broken one");
+        let base_from_flange = chain.forward(&joints_rad(secs)).expect("seven joints");
+        let expected = Transform::translation(secs, 0.0, 0.0) * base_from_flange * rig.cameras[0].parent_from_camera;
+        assert!((keyframe.world_from_camera.translation.vector - expected.translation.vector).norm() < 1e-6);
+    }
 }
 
 #[test]

@@ -107,6 +107,6 @@ fn a_rig_in_real_time_ends_when_its_time_is_over() {
     let (_, join) = keyframes(super::rig(rig, Devices::Sim).expect("the simulator"), |sample| {
         n_images += u64::from(matches!(sample, Sample::Image(image) if !image.is_depth()));
     });
-    assert!(n_images >= 2 && n_images <= 24, "{n_images} images");
+    assert!((2..=24).contains(&n_images), "{n_images} images");
     assert_eq!(join.counts().images, n_images);
 }

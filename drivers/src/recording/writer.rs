@@ -88,7 +88,7 @@ impl Recorder {
         self.try_write(sample).map_err(|source| Error::Record { path: self.path.clone(), source })
     }
 
-    /// Writes the index that viewers seek by, and waits until the disk has everything.
+    /// Writes the index that viewers seek by, and tells whether everything could be written.
     pub fn finish(mut self) -> Result<(), Error> {
         let finished = self.mcap.finish().and_then(|_| Ok(self.mcap.into_inner().flush()?));
         finished.map_err(|source| Error::Record { path: self.path, source })
@@ -191,5 +191,67 @@ fn media_type_of(name: &str) -> &'static str {
         Some("urdf" | "xml") => "application/xml",
         Some("json") => "application/json",
         _ => "application/octet-stream",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Source;
+    use crate::recording::Recording;
+    use kinematics::JointState;
+    use std::io::{Error as IoError, ErrorKind, SeekFrom};
+
+    /// A file on a disk that is full after some bytes.
+    struct Full {
+        file: File,
+        left: usize,
+    }
+
+    impl Write for Full {
+        fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+            let n_bytes = bytes.len().min(self.left);
+            if n_bytes == 0 && !bytes.is_empty() {
+                return Err(IoError::from(ErrorKind::StorageFull));
+            }
+            self.left -= n_bytes;
+            self.file.write(&bytes[..n_bytes])
+        }
+
+        fn flush(&mut self) -> std::io::Result<()> {
+            self.file.flush()
+        }
+    }
+
+    impl Seek for Full {
+        fn seek(&mut self, to: SeekFrom) -> std::io::Result<u64> {
+            self.file.seek(to)
+        }
+    }
+
+    #[test]
+    fn a_full_disk_is_told_and_what_was_written_before_stays_readable() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("run.mcap");
+        let file = File::create(&path).expect("a new file");
+        let sink = Box::new(BufWriter::new(Full { file, left: 300_000 }));
+        let mut recorder = Recorder::to(sink, &path, &About::default()).expect("room for the header");
+        let reading = |ix: i64| {
+            let position = vec![0.25; 7];
+            Sample::Joints(JointState { stamp: Stamp(ix * 1_000_000), position, velocity: vec![], effort: vec![] })
+        };
+        let told = (0..20_000).map(|ix| recorder.write(&reading(ix))).find_map(Result::err).expect("the disk is full");
+        assert!(told.to_string().contains("run.mcap") && told.to_string().contains("stays readable"), "{told}");
+        let cause = std::error::Error::source(&told).and_then(|cause| cause.source()).map(ToString::to_string);
+        assert!(cause.is_some_and(|cause| cause.contains("no storage space")), "{told:?}");
+        assert!(recorder.write(&reading(0)).is_err(), "it stays failed");
+        drop(recorder);
+        let mut recording = Recording::open(&path).expect("a recording");
+        let mut n_samples = 0;
+        while let Some(sample) = recording.next_sample().expect("readable") {
+            assert_eq!(sample, reading(n_samples));
+            n_samples += 1;
+        }
+        assert!(n_samples > 1000 && recording.damage().is_some(), "{n_samples} samples");
     }
 }
