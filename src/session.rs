@@ -112,7 +112,7 @@ impl Session {
         limits: Limits,
         json: bool,
     ) -> Self {
-        let length = limits.steps.or(limits.seconds.map(|secs| secs.ceil().max(0.0) as u64));
+        let length = limits.steps.or(limits.seconds.map(whole_secs));
         let template = if length.is_some() { "{bar:30} {elapsed} {msg}" } else { "{spinner} {elapsed} {msg}" };
         Self {
             method,
@@ -295,9 +295,15 @@ impl Session {
 
     fn show(&self) {
         let progress = self.method.progress();
-        let position = if self.limits.steps.is_some() { progress.step } else { self.secs() as u64 };
+        let position = if self.limits.steps.is_some() { progress.step } else { whole_secs(self.secs()) };
         self.bar.set_position(position);
         let psnr = self.psnr().map_or(String::new(), |psnr| format!(", {psnr:.2} dB"));
         self.bar.set_message(format!("step {}, {} splats{psnr}", progress.step, progress.primitives));
     }
+}
+
+/// For bars and such.
+#[expect(clippy::cast_possible_truncation, reason = "a cast of floats stops at the ends of u64")]
+fn whole_secs(secs: f64) -> u64 {
+    secs as u64
 }

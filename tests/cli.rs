@@ -67,6 +67,65 @@ fn a_file_that_is_not_there_exits_with_1_and_is_named() {
     );
 }
 
+/// A shipped rig file with one piece of text replaced, beside the robot that it names.
+fn changed_rig(folder: &Path, from: &str, to: &str) -> String {
+    let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
+    let text = std::fs::read_to_string(rigs.join("static-arm.toml")).expect("a shipped rig file");
+    assert!(text.contains(from), "the shipped rig file has no {from:?}");
+    std::fs::create_dir_all(folder.join("robots")).expect("room on the disk");
+    std::fs::copy(rigs.join("robots/panda.urdf"), folder.join("robots/panda.urdf")).expect("the robot");
+    let file = folder.join("rig.toml");
+    std::fs::write(&file, text.replacen(from, to, 1)).expect("room on the disk");
+    file.into_os_string().into_string().expect("a temporary folder has a plain name")
+}
+
+#[test]
+fn an_unknown_key_of_a_rig_file_is_named_with_the_nearest_known_one() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let rig = changed_rig(folder.path(), "rate_hz", "raet_hz");
+    assert_refused(&["run", &rig, "--sim"], 2, &["raet_hz", "rate_hz", "rig.toml"]);
+    assert_refused(&["run", "absent.toml"], 2, &["absent.toml"]);
+}
+
+#[test]
+fn a_device_without_driver_names_the_simulation() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let from = "[camera.wrist]\ndriver = \"sim\"";
+    let rig = changed_rig(folder.path(), from, "[camera.wrist]\ndriver = \"v4l2\"\ndevice = \"/dev/video9\"");
+    assert_refused(&["run", &rig, "--listen", "127.0.0.1:0"], 1, &["wrist", "--sim"]);
+}
+
+#[test]
+fn only_loopback_is_served() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let rig = changed_rig(folder.path(), "seed = 1", "seed = 2");
+    assert_refused(&["run", &rig, "--sim", "--listen", "0.0.0.0:0"], 1, &["0.0.0.0"]);
+}
+
+#[test]
+fn data_that_is_not_there_or_is_none_is_told() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let empty = folder.path().to_str().expect("a plain name");
+    assert_refused(&["train", "absent"], 1, &["absent"]);
+    assert_refused(&["train", empty], 1, &[empty]);
+    assert_refused(&["train", "absent.mcap"], 1, &["absent.mcap"]);
+    let recording = folder.path().join("torn.mcap");
+    std::fs::write(&recording, b"\x89MCAP0\r\n").expect("room on the disk");
+    assert_refused(&["train", recording.to_str().expect("a plain name")], 1, &["torn.mcap"]);
+    assert_refused(&["eval", empty, "absent"], 1, &["absent"]);
+    assert_refused(&["render", empty, "--pose", "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"], 1, &[empty]);
+}
+
+#[test]
+fn arguments_that_make_no_sense_exit_with_2() {
+    assert_refused(&["train", "absent", "--seconds", "NaN"], 2, &["--seconds"]);
+    assert_refused(&["train", "absent", "--scale", "0"], 2, &["--scale"]);
+    assert_refused(&["render", "model", "--pose", "1 2 3"], 2, &["16"]);
+    assert_refused(&["render", "model", "--pose", "2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"], 2, &["rotation"]);
+    assert_refused(&["render", "model"], 2, &["--camera-path"]);
+    assert_refused(&["run", "rig.toml", "--sim", "--from", "scan.mcap"], 2, &["--from"]);
+}
+
 #[test]
 fn devices_are_told_as_json() {
     let output = fieldrig(&["devices", "--json"]);

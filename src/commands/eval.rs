@@ -17,7 +17,7 @@ pub(crate) struct Args {
     data: PathBuf,
     #[command(flatten)]
     images: DataArgs,
-    /// Weights of LPIPS for SqueezeNet (safetensors) [default: the file named by FIELDRIG_LPIPS_WEIGHTS; none: no LPIPS]
+    /// Weights of LPIPS for `SqueezeNet` (safetensors) [default: what `FIELDRIG_LPIPS_WEIGHTS` names; none: no LPIPS]
     #[arg(long, value_name = "FILE")]
     lpips_weights: Option<PathBuf>,
     /// Print one JSON object

@@ -22,8 +22,7 @@ pub(crate) struct Args {
     /// Print one JSON object instead of a line for people; null is what is not known, or for PSNR infinite
     #[arg(long)]
     json: bool,
-    #[expect(clippy::doc_markdown, reason = "help for people, not documentation")]
-    /// Weights of LPIPS for SqueezeNet (safetensors) [default: the file named by FIELDRIG_LPIPS_WEIGHTS; none: no LPIPS]
+    /// Weights of LPIPS for `SqueezeNet` (safetensors) [default: what `FIELDRIG_LPIPS_WEIGHTS` names; none: no LPIPS]
     #[arg(long, value_name = "FILE")]
     lpips_weights: Option<PathBuf>,
     /// Metres per count, when both pictures are 16-bit depth

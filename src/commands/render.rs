@@ -22,7 +22,7 @@ pub(crate) struct Args {
     /// Camera path as nerfstudio writes it (JSON)
     #[arg(long, value_name = "FILE", group = "where")]
     camera_path: Option<PathBuf>,
-    /// world_from_camera, 16 numbers row major, separated by spaces or commas; camera: x right, y down, z forward
+    /// `world_from_camera`, 16 numbers row major, separated by spaces or commas; camera: x right, y down, z forward
     #[arg(long, value_name = "NUMBERS", group = "where", allow_hyphen_values = true, value_parser = numbers::<16>)]
     pose: Option<Numbers<16>>,
     /// Size of the pictures [default: the camera path's, else 1280x720]

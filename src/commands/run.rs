@@ -117,11 +117,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 fn save(live: Live, rig: &Rig, kind: Kind, out: &Path, damage: &OnceLock<String>) -> anyhow::Result<Exit> {
     let n_keyframes = live.keyframes().len();
     let live_error_m = worst_position_error_m(live.keyframes());
+    run_folder::write_keyframe_list(&out.join("keyframes.txt"), live.keyframes())?;
     let (session, leftover) = live.finish();
     let leftover = leftover?;
     let counts = leftover.join.counts();
     log::info!("{counts}");
-    leftover.join.write_list(&out.join("keyframes.txt"))?;
     let particulars = Particulars {
         method: kind.name(),
         seed: rig.train.seed,

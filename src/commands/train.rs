@@ -29,7 +29,7 @@ pub(crate) struct Args {
     steps: Option<u64>,
     #[command(flatten)]
     images: DataArgs,
-    /// Weights of LPIPS for SqueezeNet (safetensors) [default: the file named by FIELDRIG_LPIPS_WEIGHTS; none: no LPIPS]
+    /// Weights of LPIPS for `SqueezeNet` (safetensors) [default: what `FIELDRIG_LPIPS_WEIGHTS` names; none: no LPIPS]
     #[arg(long, value_name = "FILE")]
     lpips_weights: Option<PathBuf>,
     /// Where the results go [default: runs/<time>]
@@ -104,7 +104,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 impl Args {
     fn limits(&self) -> Result<Limits, BadArgument> {
         const USUAL_SECONDS: f64 = 120.0;
-        if self.seconds.is_some_and(|seconds| !(seconds >= 0.0)) {
+        if self.seconds.is_some_and(|seconds| seconds.is_nan() || seconds < 0.0) {
             return Err(BadArgument("--seconds: must be a number of at least 0".into()));
         }
         let seconds = self.seconds.or(self.steps.is_none().then_some(USUAL_SECONDS));

@@ -20,13 +20,11 @@ pub(crate) use refusal::{Counts, Refusal};
 
 use crate::config::{self, CameraDriver, Parent, Rig};
 use accept::Acceptance;
-use anyhow::Context;
 use assemble::Lens;
 use drivers::{Image, Sample, TruthImage};
 use kinematics::{HistoryError, Stamp, Transform};
 use motion::{Motion, Posed};
 use spacing::Spacing;
-use std::path::Path;
 use std::sync::Arc;
 use store::KeyframeStore;
 use trainer::{Keyframe, Split};
@@ -149,11 +147,6 @@ impl Join {
     /// The keyframes in the store, in the order of their acceptance.
     pub(crate) fn keyframes(&self) -> impl Iterator<Item = &Arc<Keyframe>> {
         self.store.iter()
-    }
-
-    /// Writes `keyframes.txt`: camera, stamp and split of every keyframe in the store.
-    pub(crate) fn write_list(&self, path: &Path) -> anyhow::Result<()> {
-        std::fs::write(path, list::text_of(self.store.iter())).with_context(|| format!("cannot write {path:?}"))
     }
 
     fn push_image(&mut self, image: Image, events: &mut Vec<JoinEvent>) {
