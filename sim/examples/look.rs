@@ -28,7 +28,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             fixed.intrinsics.lens = kinematics::Lens::BrownConrady([0.06, -0.12, 0.0005, -0.0003, 0.0]);
             fixed.parent = Parent::World;
             fixed.parent_from_camera =
-                Isometry3::face_towards(&Point3::new(1.0, 0.0, 0.75), &Point3::new(0.70, 0.0, 0.15), &-Vector3::z());
+                Isometry3::face_towards(&Point3::new(1.04, 0.0, 0.75), &Point3::new(0.74, 0.0, 0.15), &-Vector3::z());
             fixed.depth = None;
             fixed.rate_hz = 5.0;
             config.cameras.push(fixed);

@@ -10,7 +10,7 @@ use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
 /// Height of the table top above the robot's base, metres.
 pub const TABLE_Z_M: f64 = 0.12;
 /// Middle of the target area on the table, metres.
-pub const TARGET_XY_M: [f64; 2] = [0.70, 0.0];
+pub const TARGET_XY_M: [f64; 2] = [0.74, 0.0];
 /// Half the side of the tag cube, metres.
 pub const CUBE_HALF_M: f64 = 0.03;
 /// Half sizes of the wooden block, metres.
@@ -18,12 +18,12 @@ pub const BLOCK_HALF_M: [f64; 3] = [0.045, 0.02, 0.025];
 
 /// Half sizes of the table's top along x and y, and its nearest x, metres.
 const TABLE_HALF_XY_M: [f64; 2] = [0.40, 0.50];
-const TABLE_FRONT_X_M: f64 = 0.36;
+const TABLE_FRONT_X_M: f64 = TARGET_XY_M[0] - 0.34;
 const TABLE_HALF_THICKNESS_M: f64 = 0.02;
 /// Half width and half height of a wall, metres.
 const WALL_HALF_M: [f64; 2] = [0.50, 0.50];
 /// The corner where the walls meet, metres.
-const CORNER_XY_M: [f64; 2] = [1.12, 0.0];
+const CORNER_XY_M: [f64; 2] = [TARGET_XY_M[0] + 0.42, 0.0];
 
 fn on_table(x_m: f64, y_m: f64, above_m: f64, yaw_degrees: f64) -> Transform {
     Transform::from_parts(

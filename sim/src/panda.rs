@@ -38,6 +38,10 @@ pub(crate) const LOWER_RAD: [f64; N_JOINTS] = [-2.8973, -1.7628, -2.8973, -3.071
 pub(crate) const UPPER_RAD: [f64; N_JOINTS] = [2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973];
 /// Largest joint velocities, radians per second.
 pub(crate) const MAX_SPEED_RAD_S: [f64; N_JOINTS] = [2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61];
+/// Largest joint accelerations, radians per second squared.
+pub(crate) const MAX_ACCELERATION_RAD_S2: [f64; N_JOINTS] = [15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0];
+/// Largest joint jerks, radians per second cubed.
+pub(crate) const MAX_JERK_RAD_S3: [f64; N_JOINTS] = [7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10_000.0, 10_000.0];
 /// Largest joint torques, newton metres.
 pub(crate) const MAX_TORQUE_NM: [f64; N_JOINTS] = [87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0];
 

@@ -79,6 +79,7 @@ pub(crate) struct Follower {
     flange_from_camera: Transform,
     position_rad: Joints,
     velocity_rad_s: Joints,
+    acceleration_rad_s2: Joints,
 }
 
 /// Where the arm likes to be: far from its limits, elbow up.
@@ -92,8 +93,13 @@ const DAMPING: f64 = 0.03;
 /// How fast pose errors and discomfort fade, per second.
 const POSE_GAIN_HZ: f64 = 8.0;
 const COMFORT_GAIN_HZ: f64 = 0.6;
-/// The joint velocity follows its wish with this time constant, seconds: what keeps the motion smooth.
-const SMOOTHING_SECS: f64 = 0.03;
+/// The joint velocity follows its wish as a critically damped spring of this frequency, radians per second: what keeps
+/// the motion smooth.
+const SMOOTHING_RAD_S: f64 = 40.0;
+/// A joint may approach its limit by this share of the remaining distance per second.
+const APPROACH_HZ: f64 = 3.0;
+/// Share of the arm's largest accelerations and jerks that the scan uses.
+const BEND_SHARE: f64 = 0.6;
 
 impl Follower {
     /// Starts at rest, at the scan's first pose.
@@ -104,6 +110,7 @@ impl Follower {
             flange_from_camera,
             position_rad: Joints::from(COMFORTABLE_RAD),
             velocity_rad_s: Joints::zeros(),
+            acceleration_rad_s2: Joints::zeros(),
         };
         let wanted = scan.world_from_camera(0.0);
         for _ in 0..3000 {
@@ -114,7 +121,27 @@ impl Follower {
         if pose_error(&wanted, &base_from_camera).norm() > TOLERANCE {
             return Err(Error::Unreachable { at_secs: 0.0 });
         }
+        follower.clone().warn_where_the_arm_falls_short();
         Ok(follower)
+    }
+
+    /// Tries half a minute of the scan without dynamics: with some camera mounts the arm meets its limits and looks away.
+    fn warn_where_the_arm_falls_short(mut self) {
+        const TRIED_SECS: f64 = 30.0;
+        const STEP_SECS: f64 = 0.005;
+        const TOLERANCE_RAD: f64 = 0.35;
+        let (mut worst_rad, mut secs) = (0.0_f64, 0.0);
+        while secs < TRIED_SECS {
+            secs += STEP_SECS;
+            self.advance(secs, STEP_SECS);
+            let base_from_camera = panda::base_from_flange(&self.position_rad) * self.flange_from_camera;
+            let error = pose_error(&self.scan.world_from_camera(secs), &base_from_camera);
+            worst_rad = worst_rad.max(error.fixed_rows::<3>(3).norm());
+        }
+        if worst_rad > TOLERANCE_RAD {
+            let degrees = worst_rad.to_degrees();
+            log::warn!("the arm cannot follow the whole scan with this camera mount: up to {degrees:.0} degrees off");
+        }
     }
 
     pub(crate) fn position_rad(&self) -> &Joints {
@@ -131,12 +158,26 @@ impl Follower {
         let before = self.scan.world_from_camera(secs - step_secs);
         let wanted_twist = pose_error(&wanted, &before) / step_secs;
         let wish = self.wish(&wanted, &wanted_twist);
-        let limit = |ix: usize| SPEED_SHARE * panda::MAX_SPEED_RAD_S[ix];
-        let wish = Joints::from_fn(|ix, _| wish[ix].clamp(-limit(ix), limit(ix)));
-        self.velocity_rad_s += (wish - self.velocity_rad_s) * (step_secs / SMOOTHING_SECS);
-        let position = clamp_to_limits(self.position_rad + self.velocity_rad_s * step_secs);
-        self.velocity_rad_s = (position - self.position_rad) / step_secs;
-        self.position_rad = position;
+        for ix in 0..N_JOINTS {
+            let allowed = self.allowed_speed_rad_s(ix);
+            let slow = wish[ix].clamp(allowed[0], allowed[1]) - self.velocity_rad_s[ix];
+            let acceleration = self.acceleration_rad_s2[ix];
+            let jerk = (slow * SMOOTHING_RAD_S - 2.0 * acceleration) * SMOOTHING_RAD_S;
+            let (max_jerk, max_bend) = (panda::MAX_JERK_RAD_S3[ix], panda::MAX_ACCELERATION_RAD_S2[ix]);
+            let acceleration = acceleration + jerk.clamp(-BEND_SHARE * max_jerk, BEND_SHARE * max_jerk) * step_secs;
+            self.acceleration_rad_s2[ix] = acceleration.clamp(-BEND_SHARE * max_bend, BEND_SHARE * max_bend);
+        }
+        self.velocity_rad_s += self.acceleration_rad_s2 * step_secs;
+        self.position_rad = clamp_to_limits(self.position_rad + self.velocity_rad_s * step_secs);
+    }
+
+    /// Lowest and highest joint velocity: slower towards a limit the nearer it is.
+    fn allowed_speed_rad_s(&self, ix: usize) -> [f64; 2] {
+        let (position, fastest) = (self.position_rad[ix], SPEED_SHARE * panda::MAX_SPEED_RAD_S[ix]);
+        let to_lower = position - panda::LOWER_RAD[ix] - LIMIT_MARGIN_RAD;
+        let to_upper = panda::UPPER_RAD[ix] - LIMIT_MARGIN_RAD - position;
+        let towards = |distance: f64| (APPROACH_HZ * distance).clamp(0.0, fastest);
+        [-towards(to_lower), towards(to_upper)]
     }
 
     /// Joint velocity that would bring the camera to the wanted pose, and the free joint motion to a comfortable one.

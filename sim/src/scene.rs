@@ -103,3 +103,32 @@ fn brackets(config: &Config) -> String {
     }
     xml
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::panda::Joints;
+    use mujoco_rs::prelude::{MjData, MjtObjBase};
+    use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+
+    #[test]
+    fn mujocos_flange_is_where_our_kinematics_and_the_urdf_put_it() {
+        const TOLERANCE: f64 = 1e-9;
+        let model = build(&Config::default(), [64, 64]).expect("the scene is valid");
+        let flange_ix = model.name_to_id(MjtObjBase::mjOBJ_BODY, "panda_link8").expect("the flange is a body");
+        let chain = kinematics::Chain::from_urdf(crate::PANDA_URDF, "panda_link0", "panda_link8").expect("valid");
+        let mut data = MjData::new(&model);
+        for position_rad in [[0.0; 7], [0.4, -0.9, 1.3, -2.2, -0.7, 1.8, 0.6], [-2.1, 1.1, 0.3, -0.4, 2.2, 3.1, -1.9]] {
+            data.qpos_mut().copy_from_slice(&position_rad);
+            data.forward_kinematics();
+            let [w, x, y, z] = data.xquat()[flange_ix];
+            let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+            let ours = panda::base_from_flange(&Joints::from(position_rad));
+            let urdf = chain.forward(&position_rad).expect("seven joints");
+            for pose in [ours, urdf] {
+                assert!((pose.translation.vector - Vector3::from(data.xpos()[flange_ix])).norm() < TOLERANCE);
+                assert!(pose.rotation.angle_to(&turn) < 10.0 * TOLERANCE);
+            }
+        }
+    }
+}

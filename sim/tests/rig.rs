@@ -64,6 +64,17 @@ fn gray_at(image: &Image, [u, v]: [f64; 2]) -> f64 {
         + (gray(image, column, row + 1) * (1.0 - fx) + gray(image, column + 1, row + 1) * fx) * fy
 }
 
+/// A point on the table, from the middle of the target area.
+fn on_table(x_m: f64, y_m: f64) -> Point3<f64> {
+    let [target_x, target_y] = sim::layout::TARGET_XY_M;
+    Point3::new(target_x + x_m, target_y + y_m, sim::layout::TABLE_Z_M)
+}
+
+/// The middle of the target area, at half the height of its objects.
+fn target() -> Point3<f64> {
+    on_table(0.0, 0.0) + Vector3::z() * 0.06
+}
+
 /// Position on the tag cube's upper side: `right` and `down` from the tag's top left, 0 to 1. The tag there has the id 4.
 fn on_tag(right: f64, down: f64) -> Point3<f64> {
     let side = 2.0 * sim::layout::CUBE_HALF_M;
@@ -102,14 +113,22 @@ fn the_arm_scans_inside_its_limits_and_sees_the_target_from_many_sides() {
             assert!(speed < limits.velocity, "joint {ix} at {speed} rad/s");
         }
     }
+    for (ix, (bend, jerk)) in MAX_BEND_RAD_S2.into_iter().zip(MAX_JERK_RAD_S3).enumerate() {
+        let speeds: Vec<f64> = run.joints.iter().map(|state| state.velocity[ix]).collect();
+        for speeds in speeds.windows(3) {
+            let [first, second] = [speeds[1] - speeds[0], speeds[2] - speeds[1]].map(|change| change * 1e3);
+            assert!(first.abs() < bend, "joint {ix}: {first} rad/s^2");
+            assert!((second - first).abs() * 1e3 < jerk, "joint {ix}: {} rad/s^3", (second - first) * 1e3);
+        }
+    }
     let [mut azimuths, mut elevations, mut distances] = [vec![], vec![], vec![]];
     for truth in &run.truth {
-        let from_target = truth.world_from_camera.translation.vector - Vector3::new(0.70, 0.0, 0.18);
+        let from_target = truth.world_from_camera.translation.vector - target().coords;
         azimuths.push((-from_target.y).atan2(-from_target.x).to_degrees());
         elevations.push((from_target.z / from_target.norm()).asin().to_degrees());
         distances.push(from_target.norm());
         // The target stays in view.
-        let seen = pixel(&run.info.cameras[0].intrinsics, &truth.world_from_camera, &Point3::new(0.70, 0.0, 0.18));
+        let seen = pixel(&run.info.cameras[0].intrinsics, &truth.world_from_camera, &target());
         assert!(run.info.cameras[0].intrinsics.contains(seen), "{seen:?}");
     }
     let span = |values: &[f64]| {
@@ -119,6 +138,10 @@ fn the_arm_scans_inside_its_limits_and_sees_the_target_from_many_sides() {
     assert!(span(&elevations) > 30.0, "elevation {}", span(&elevations));
     assert!(span(&distances) > 0.12, "distance {}", span(&distances));
 }
+
+/// What Franka allows its arm.
+const MAX_BEND_RAD_S2: [f64; 7] = [15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0];
+const MAX_JERK_RAD_S3: [f64; 7] = [7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10_000.0, 10_000.0];
 
 /// One image a second, small: for looking at the motion alone.
 fn slow_camera() -> Config {
@@ -195,7 +218,7 @@ fn depth_is_that_of_the_table_and_the_cube() {
     let depth = run.depth.last().expect("depth came");
     assert_eq!(depth.stamp, truth.image.stamp);
     let camera_from_world = truth.world_from_camera.inverse();
-    let corners = [Point3::new(0.60, -0.16, 0.12), Point3::new(0.56, 0.0, 0.12), on_tag(0.3, 0.6), on_tag(0.7, 0.2)];
+    let corners = [on_table(-0.10, -0.16), on_table(-0.14, 0.0), on_tag(0.3, 0.6), on_tag(0.7, 0.2)];
     for point in corners {
         let in_camera = camera_from_world * point;
         let [u, v] = intrinsics.project(&in_camera.coords).expect("in front");
@@ -241,10 +264,16 @@ fn noise_is_as_configured() {
 #[test]
 fn the_rolling_shutter_puts_each_row_where_its_own_pose_sees_it() {
     const TOLERANCE_PX: f64 = 0.3;
+    const READOUT_SECS: f64 = 0.04; // Slower than real ones, so that there is more to see.
     let mut config = Config { n_images: Some(16), ..Config::default() };
     config.cameras[0].rate_hz = 1.3;
     config.cameras[0].depth = None;
-    config.cameras[0].sensor = sim::SensorConfig { noise_sigma: 0.0, supersample: 2, ..config.cameras[0].sensor };
+    config.cameras[0].sensor = sim::SensorConfig {
+        noise_sigma: 0.0,
+        supersample: 2,
+        readout_micros: 1e6 * READOUT_SECS,
+        ..config.cameras[0].sensor
+    };
     let run = play(&config);
     let (intrinsics, chain) = (&run.info.cameras[0].intrinsics, chain(&run.info));
     let mut largest_px: f64 = 0.0;
@@ -256,7 +285,7 @@ fn the_rolling_shutter_puts_each_row_where_its_own_pose_sees_it() {
             let mut seen = still(point);
             for _ in 0..3 {
                 let share = seen[1] / f64::from(intrinsics.size_px[1]) - 0.5;
-                let stamp = truth.image.stamp.plus_secs(0.015 * share);
+                let stamp = truth.image.stamp.plus_secs(READOUT_SECS * share);
                 let flange = chain.forward(&joints_at(&run.joints, stamp)).expect("seven joints");
                 seen = pixel(intrinsics, &(flange * run.info.cameras[0].parent_from_camera), point);
             }
