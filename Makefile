@@ -4,7 +4,7 @@
 # the page's npm packages) and says so; without root it prints the one line to run.
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check deps web cargo mujoco packages-build packages-gpu packages-sim packages-web bless
+.PHONY: help demo test check deps web cargo packages mujoco open-ends
 
 # One feature set everywhere, so that dependencies compile once.
 FEATURES := --features sim
@@ -12,42 +12,36 @@ FEATURES := --features sim
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: packages-build packages-gpu mujoco web ## Simulate the static arm and serve the growing scene; needs no display
+demo: deps web ## Simulate the static arm and serve the growing scene; needs no display
 	cargo build --release $(FEATURES)
-	cargo run --quiet --release $(FEATURES) -- run rigs/static-arm.toml --sim
+	target/release/fieldrig run rigs/static-arm.toml --sim
 
-test: check ## Lints, documentation and every test that needs no device
+test: check web ## Lints, documentation and every test that needs no device
 	cargo test --workspace $(FEATURES) --no-fail-fast
 
-check: deps ## Format, clippy, documentation, licences, open ends
+check: deps open-ends ## Format, clippy, documentation, kernels, licences, open ends
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets $(FEATURES) -- -D warnings
 	cargo clippy --workspace --exclude sim --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps $(FEATURES)
-	@scripts/check-open-ends.sh
+	cargo test --workspace $(FEATURES) --lib every_kernel_parses_and_validates
 	@if cargo deny --version >/dev/null 2>&1; then cargo deny check; \
 	else echo "cargo deny: skipped, not installed (cargo install --locked cargo-deny)"; fi
 
-deps: packages-build packages-gpu mujoco ## What building and testing need: system packages and the MuJoCo library
+deps: cargo packages mujoco ## Install what building and testing need
 
-web: packages-web ## Build the web page that the binary embeds
+web: cargo packages ## Build the web page that the binary embeds
 	scripts/build-web.sh
 
 cargo:
 	@command -v cargo >/dev/null 2>&1 || { echo "cargo is missing; run this line, then try again:" >&2; \
 	echo "    curl --proto '=https' --tlsv1.2 -sSf https://sh.rustup.rs | sh" >&2; exit 1; }
 
-mujoco: packages-sim
+packages:
+	@scripts/install-packages.sh build gpu sim web
+
+mujoco: packages
 	@scripts/fetch-mujoco.sh
 
-packages-build: cargo
-	@scripts/install-packages.sh build
-
-packages-gpu:
-	@scripts/install-packages.sh gpu
-
-packages-sim:
-	@scripts/install-packages.sh sim
-
-packages-web:
-	@scripts/install-packages.sh web
+open-ends:
+	@scripts/check-open-ends.sh

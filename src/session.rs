@@ -28,6 +28,8 @@ pub(crate) struct Limits {
 pub(crate) struct Evaluators {
     /// At the marks: thorough where nobody waits, quick in a live run.
     pub(crate) at_marks: Evaluator,
+    /// Test keyframes scored at a mark, spread evenly over all; the others are scored at the end only.
+    pub(crate) most_at_marks: usize,
     /// At the end.
     pub(crate) at_end: Evaluator,
 }
@@ -38,6 +40,7 @@ pub(crate) struct Session {
     gpu: Arc<Gpu>,
     /// At the marks.
     evaluator: Evaluator,
+    most_at_marks: usize,
     /// At the end.
     last_evaluator: Evaluator,
     tests: VecDeque<Arc<Keyframe>>,
@@ -73,6 +76,8 @@ struct Eval {
     step: u64,
     #[serde(flatten)]
     scores: Scores,
+    /// Test images that the scores are means over.
+    n_images: usize,
     primitives: u64,
     bytes: u64,
     step_millis: Option<f64>,
@@ -118,6 +123,7 @@ impl Session {
             method,
             gpu,
             evaluator: evaluators.at_marks,
+            most_at_marks: evaluators.most_at_marks,
             last_evaluator: evaluators.at_end,
             tests: VecDeque::new(),
             limits,
@@ -211,7 +217,7 @@ impl Session {
         self.method.save(out)?;
         let checkpoint_sha256 = run_folder::checkpoint_sha256(out)?;
         std::mem::swap(&mut self.evaluator, &mut self.last_evaluator);
-        let per_image = self.score_all()?;
+        let per_image = self.score(usize::MAX)?;
         let progress = self.method.progress();
         let done = Done {
             event: "done",
@@ -239,12 +245,13 @@ impl Session {
         Ok(print::line(format_args!("saved in {}", out.display()))?)
     }
 
-    /// Scores every test keyframe off the clock.
-    fn score_all(&mut self) -> anyhow::Result<Vec<ImageScores>> {
+    /// Scores at most `most` test keyframes, off the clock.
+    fn score(&mut self, most: usize) -> anyhow::Result<Vec<ImageScores>> {
         self.gpu.wait()?;
         let before = Instant::now();
-        let tests = self.tests.make_contiguous();
-        let images = self.evaluator.score_all(self.method.as_mut(), tests)?;
+        let stride = self.tests.len().div_ceil(most).max(1);
+        let tests: Vec<Arc<Keyframe>> = self.tests.iter().step_by(stride).cloned().collect();
+        let images = self.evaluator.score_all(self.method.as_mut(), &tests)?;
         self.gpu.wait()?;
         self.clock.excluded += before.elapsed();
         Ok(images)
@@ -254,7 +261,7 @@ impl Session {
         // What was queued up to here belongs to the mark.
         self.gpu.wait()?;
         let seconds = self.secs();
-        let images = self.score_all()?;
+        let images = self.score(self.most_at_marks)?;
         for image in &images {
             self.newest_psnr.insert((image.camera.clone(), image.stamp_nanos), image.psnr);
         }
@@ -265,6 +272,7 @@ impl Session {
             seconds,
             step: progress.step,
             scores: Scores::mean(&images),
+            n_images: images.len(),
             primitives: progress.primitives,
             bytes: progress.bytes,
             step_millis: (progress.step > 0).then_some(progress.step_millis),

@@ -62,6 +62,9 @@ pub(crate) struct Args {
     json: bool,
 }
 
+/// People look on while a mark is scored: it must not take long.
+const MOST_SCORED_AT_MARKS: usize = 12;
+
 /// What the report says beside scores.
 #[derive(Debug, Serialize)]
 struct Particulars {
@@ -92,7 +95,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let gpu = super::open_gpu()?;
     let notes = notes(&gpu);
     let method = kind.start(gpu.clone(), method::options(&rig.train, args.steps)?)?;
-    let evaluators = Evaluators { at_marks: Evaluator::psnr_only(), at_end: Evaluator::thorough(None)? };
+    let evaluators = Evaluators {
+        at_marks: Evaluator::psnr_only(),
+        most_at_marks: MOST_SCORED_AT_MARKS,
+        at_end: Evaluator::thorough(None)?,
+    };
     let limits = Limits { seconds: args.seconds, steps: args.steps };
     let session = Session::new(gpu, method, evaluators, limits, args.json);
     let options = LiveOptions {

@@ -59,7 +59,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let limits = args.limits()?;
     let stop = Stop::on_ctrl_c()?;
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
-    let evaluators = Evaluators { at_marks: evaluator.clone(), at_end: evaluator };
+    let evaluators = Evaluators { at_marks: evaluator.clone(), most_at_marks: usize::MAX, at_end: evaluator };
     let data = Data::load(&args.data, &args.images, &args.training.overrides(), args.json)?;
     let gpu = super::open_gpu()?;
     let (kind, options) = args.model(&data)?;
