@@ -13,8 +13,8 @@ const N_IMAGES: i64 = 40;
 const SMALLER: i64 = 4;
 /// Steps of every run here.
 const N_STEPS: &str = "60";
-/// Measured 24.6 dB on this scene at this size and number of steps; less means that something broke, not that it got slower.
-const LEAST_PSNR: f64 = 16.0;
+/// Measured 18.0 dB after these few steps, of which all are coarse ones; the first keyframe's seeds alone score 16.4 dB.
+const LEAST_PSNR: f64 = 17.0;
 /// Forward kinematics, interpolation and the camera's mounting together.
 const MOST_POSITION_ERROR_M: f64 = 1e-4;
 
