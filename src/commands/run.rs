@@ -54,7 +54,7 @@ pub(crate) struct Args {
     /// Address of the page
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:7007")]
     listen: SocketAddr,
-    /// Where the results and the settled rig file go [default: `runs/<time>`]
+    /// Where the results and the settled rig file go [default: a new folder in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
     /// Print one JSON object a line
