@@ -153,7 +153,9 @@ pub enum Error {
         first_reason: String,
     },
     /// Nothing tells the lens parameters of a TUM folder.
-    #[error("{path:?}: no lens parameters: put fx fy cx cy [k1 k2 p1 p2 k3] into calibration.txt, or keep freiburg1, 2 or 3 in the name")]
+    #[error(
+        "{path:?}: no lens parameters: put fx fy cx cy [k1 k2 p1 p2 k3] into calibration.txt, or keep freiburg1, 2 or 3 in the name"
+    )]
     NoCamera {
         /// The folder.
         path: PathBuf,

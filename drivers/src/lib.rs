@@ -1,7 +1,7 @@
 //! Devices, recordings and datasets behind a few traits; what comes out is stamped samples.
 
-mod decode;
 pub mod dataset;
+mod decode;
 mod error;
 mod live;
 pub mod recording;

@@ -21,7 +21,9 @@ pub enum Error {
     #[error("the GPU stopped answering: its driver reset or lost the device")]
     DeviceLost,
     /// A buffer past the adapter's limit.
-    #[error("buffer {label}: {bytes} bytes are more than this GPU can bind ({limit_bytes} bytes); lower --max-splats or the image size")]
+    #[error(
+        "buffer {label}: {bytes} bytes are more than this GPU can bind ({limit_bytes} bytes); lower --max-splats or the image size"
+    )]
     BufferTooLarge {
         /// Name of the buffer.
         label: String,

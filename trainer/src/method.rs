@@ -31,6 +31,8 @@ pub trait Method {
     /// A queued update is lost, and done again later, when it turns out that a buffer was too small. When all `n` were
     /// queued the call waits for them, so that [`Method::progress`] is exact; loop until it has reached the step you want.
     fn step(&mut self, n: u64) -> Result<u64, Error>;
+    /// Waits until everything that learning needs is compiled; [`Method::step`] would wait for it otherwise.
+    fn prepare(&mut self) -> Result<(), Error>;
     /// Draws a picture; works from the first keyframe on.
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error>;
     /// Where training stands.

@@ -76,9 +76,13 @@ impl Gpu {
     /// Name, kind, driver and optional features of the adapter, for people.
     pub fn describe(&self) -> String {
         let info = &self.info;
-        let subgroups = self.optional.subgroup_lanes.map_or("no subgroups".to_owned(), |lanes| format!("subgroups of {lanes}"));
+        let subgroups =
+            self.optional.subgroup_lanes.map_or("no subgroups".to_owned(), |lanes| format!("subgroups of {lanes}"));
         let timestamps = if self.optional.timestamps { "timestamps" } else { "no timestamps" };
-        format!("{} ({:?}, {:?}, {} {}), {subgroups}, {timestamps}", info.name, info.device_type, info.backend, info.driver, info.driver_info)
+        format!(
+            "{} ({:?}, {:?}, {} {}), {subgroups}, {timestamps}",
+            info.name, info.device_type, info.backend, info.driver, info.driver_info
+        )
     }
 
     /// Whether kernels run on the CPU.
@@ -110,7 +114,11 @@ impl Gpu {
     pub fn storage(&self, label: &str, bytes: u64) -> Result<Buffer, Error> {
         let bytes = bytes.max(16).next_multiple_of(16);
         if bytes > self.max_binding_bytes() {
-            return Err(Error::BufferTooLarge { label: label.to_owned(), bytes, limit_bytes: self.max_binding_bytes() });
+            return Err(Error::BufferTooLarge {
+                label: label.to_owned(),
+                bytes,
+                limit_bytes: self.max_binding_bytes(),
+            });
         }
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST;
         Ok(self.buffer(label, bytes, usage))
@@ -183,7 +191,9 @@ impl Gpu {
 
     /// Waits until everything submitted is done.
     pub fn wait(&self) -> Result<(), Error> {
-        self.device.poll(wgpu::PollType::Wait { submission_index: None, timeout: None }).map_err(|_| Error::DeviceLost)?;
+        self.device
+            .poll(wgpu::PollType::Wait { submission_index: None, timeout: None })
+            .map_err(|_| Error::DeviceLost)?;
         Ok(())
     }
 
@@ -192,7 +202,12 @@ impl Gpu {
     }
 
     fn buffer(&self, label: &str, bytes: u64, usage: wgpu::BufferUsages) -> Buffer {
-        let raw = self.device.create_buffer(&wgpu::BufferDescriptor { label: Some(label), size: bytes, usage, mapped_at_creation: false });
+        let raw = self.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some(label),
+            size: bytes,
+            usage,
+            mapped_at_creation: false,
+        });
         let live = self.live_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes;
         self.peak_bytes.fetch_max(live, Ordering::Relaxed);
         Buffer { id: self.fresh_id(), raw, bytes, live_bytes: self.live_bytes.clone() }

@@ -24,15 +24,10 @@ enum Pass {
 /// A list of GPU passes; listing them does not touch the GPU.
 ///
 /// Bind groups are kept between lists, keyed by kernel and buffers; [`Passes::forget_bindings`] lets go of them.
+#[derive(Default)]
 pub struct Passes {
     list: Vec<Pass>,
     bind_groups: HashMap<(u64, Vec<u64>), wgpu::BindGroup>,
-}
-
-impl Default for Passes {
-    fn default() -> Self {
-        Self { list: Vec::new(), bind_groups: HashMap::new() }
-    }
 }
 
 impl std::fmt::Debug for Passes {
@@ -71,9 +66,16 @@ impl Passes {
                 .bindings
                 .iter()
                 .zip(&found)
-                .map(|(binding, buffer)| wgpu::BindGroupEntry { binding: binding.number, resource: buffer.raw.as_entire_binding() })
+                .map(|(binding, buffer)| wgpu::BindGroupEntry {
+                    binding: binding.number,
+                    resource: buffer.raw.as_entire_binding(),
+                })
                 .collect();
-            gpu.device.create_bind_group(&wgpu::BindGroupDescriptor { label: Some(pipeline.name), layout: &pipeline.layout, entries: &entries })
+            gpu.device.create_bind_group(&wgpu::BindGroupDescriptor {
+                label: Some(pipeline.name),
+                layout: &pipeline.layout,
+                entries: &entries,
+            })
         });
         self.list.push(Pass::Dispatch {
             pipeline: pipeline.raw.clone(),
@@ -115,7 +117,13 @@ impl Passes {
     /// `None` when the adapter has no timestamps.
     pub fn submit_spanned(&mut self, gpu: &Gpu) -> Result<Option<f64>, Error> {
         let timed = gpu.optional.timestamps;
-        let queries = timed.then(|| gpu.device.create_query_set(&wgpu::QuerySetDescriptor { label: Some("span"), ty: wgpu::QueryType::Timestamp, count: 2 }));
+        let queries = timed.then(|| {
+            gpu.device.create_query_set(&wgpu::QuerySetDescriptor {
+                label: Some("span"),
+                ty: wgpu::QueryType::Timestamp,
+                count: 2,
+            })
+        });
         let stamps = gpu.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some("span"),
             size: 16,
@@ -147,7 +155,11 @@ impl Passes {
             return Ok(Vec::new());
         }
         let n = u32_of(self.list.len() as u64);
-        let queries = gpu.device.create_query_set(&wgpu::QuerySetDescriptor { label: Some("timing"), ty: wgpu::QueryType::Timestamp, count: 2 * n.max(1) });
+        let queries = gpu.device.create_query_set(&wgpu::QuerySetDescriptor {
+            label: Some("timing"),
+            ty: wgpu::QueryType::Timestamp,
+            count: 2 * n.max(1),
+        });
         let stamps = gpu.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some("timing"),
             size: 16 * u64::from(n.max(1)),
@@ -182,7 +194,11 @@ impl Passes {
         let ticks: Vec<u64> = gpu.read(&copy, n_stamps)?;
         let nanos_per_tick = f64::from(gpu.queue.get_timestamp_period());
         let millis = |span: &[u64]| span[1].saturating_sub(span[0]) as f64 * nanos_per_tick / 1e6;
-        Ok(names.into_iter().zip(ticks.chunks_exact(2)).map(|(name, span)| PassTiming { name, millis: millis(span) }).collect())
+        Ok(names
+            .into_iter()
+            .zip(ticks.chunks_exact(2))
+            .map(|(name, span)| PassTiming { name, millis: millis(span) })
+            .collect())
     }
 }
 

@@ -73,7 +73,9 @@ pub(super) fn bindings(module: &naga::Module) -> Vec<Binding> {
         .filter_map(|(_, variable)| {
             let access = match variable.space {
                 naga::AddressSpace::Uniform => Access::Uniform,
-                naga::AddressSpace::Storage { access } if access.contains(naga::StorageAccess::STORE) => Access::ReadWrite,
+                naga::AddressSpace::Storage { access } if access.contains(naga::StorageAccess::STORE) => {
+                    Access::ReadWrite
+                }
                 naga::AddressSpace::Storage { .. } => Access::Read,
                 _ => return None,
             };

@@ -7,9 +7,11 @@ struct Growth {
     capacity: u32,        // stride between planes
     n_sh_rest: u32,       // planes of sh_rest that exist
     child_spread: f32,    // of a child's place, in standard deviations of its parent
-    child_log_scale: f32, // added to the log_scale of parent and child
     least_opacity: f32,   // below it a splat is given a new place
+    unused: f32,
 }
+
+const NO_PARENT = 0xffffffffu;
 
 // Whether a splat has died: hardly visible, or not a number.
 fn is_dead(mean: vec4f, shape: vec4f, least_opacity: f32) -> bool {

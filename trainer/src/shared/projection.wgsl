@@ -2,10 +2,9 @@
 //
 // twin      splat/reference/project.rs
 // source    Zwicker et al. 2001 (EWA volume splatting); Kerbl et al. 2023, section 4; the clamp of x/z and y/z in the
-//           Jacobian and the low-pass of 0.3 pixels squared are those of gsplat. The shift by the row's share of the
+//           Jacobian and the low-pass of 0.3 pixels squared are those of gsplat (0.3 at full size). The shift by the row's share of the
 //           readout moves the point, and its Jacobian, by the camera's twist.
 
-const LOW_PASS_PX2 = 0.3;
 const MIN_ALPHA = 0.00392156862745098; // 1 / 255
 const MAX_ALPHA = 0.999;
 const MIN_TRANSMITTANCE = 1e-4;
@@ -70,10 +69,11 @@ fn project_splat(view: View, mean: vec3f, rotation_wxyz: vec4f, log_scale: vec3f
     out.axes = mat3x3f(turned[0] * out.scale.x, turned[1] * out.scale.y, turned[2] * out.scale.z);
     let row_x = out.jacobian_x * out.axes;
     let row_y = out.jacobian_y * out.axes;
-    out.covariance = vec3f(dot(row_x, row_x) + LOW_PASS_PX2, dot(row_x, row_y), dot(row_y, row_y) + LOW_PASS_PX2);
+    let low_pass_px2 = view.center_in_world.w;
+    out.covariance = vec3f(dot(row_x, row_x) + low_pass_px2, dot(row_x, row_y), dot(row_y, row_y) + low_pass_px2);
     // The determinant without cancellation: that of the splat alone is a squared cross product.
     let area = cross(row_x, row_y);
-    out.determinant = dot(area, area) + LOW_PASS_PX2 * (out.covariance.x + out.covariance.z - LOW_PASS_PX2);
+    out.determinant = dot(area, area) + low_pass_px2 * (out.covariance.x + out.covariance.z - low_pass_px2);
     return out;
 }
 

@@ -6,7 +6,7 @@ struct View {
     camera_row_0: vec4f,       // camera_from_world, upper three rows
     camera_row_1: vec4f,
     camera_row_2: vec4f,
-    center_in_world: vec4f,    // of the camera; w unused
+    center_in_world: vec4f,    // of the camera; w: low-pass on the image plane, pixels squared
     focal_px: vec2f,
     principal_px: vec2f,
     size_px: vec2u,

@@ -68,7 +68,8 @@ impl RadixSort {
     }
 
     fn of_form(gpu: &Gpu, parallel: bool) -> Result<Self, Error> {
-        let [count, scan, scatter] = if parallel { [KERNELS[0], KERNELS[1], KERNELS[2]] } else { [KERNELS[3], KERNELS[4], KERNELS[5]] };
+        let [count, scan, scatter] =
+            if parallel { [KERNELS[0], KERNELS[1], KERNELS[2]] } else { [KERNELS[3], KERNELS[4], KERNELS[5]] };
         Ok(Self {
             parallel,
             count: Pipeline::new(gpu, count, &[])?,
@@ -82,7 +83,8 @@ impl RadixSort {
     pub fn buffers(&self, gpu: &Gpu, label: &str, n_max: u32, n_bits: u32, counter: u32) -> Result<SortBuffers, Error> {
         let max_blocks = n_max.div_ceil(self.block()).max(1);
         let words = |name: &str, n: u32| gpu.storage(&format!("{label}.{name}"), 4 * u64::from(n.max(1)));
-        let digits = (0..n_bits.div_ceil(8)).map(|pass| gpu.uniform_with("sort.digit", &Digit { shift: 8 * pass, counter, max_blocks, unused: 0 }));
+        let digits = (0..n_bits.div_ceil(8))
+            .map(|pass| gpu.uniform_with("sort.digit", &Digit { shift: 8 * pass, counter, max_blocks, unused: 0 }));
         Ok(SortBuffers {
             keys: [words("keys_a", n_max)?, words("keys_b", n_max)?],
             values: [words("values_a", n_max)?, words("values_b", n_max)?],
@@ -94,7 +96,15 @@ impl RadixSort {
     }
 
     /// Sorts by the low `n_bits`; says which half of the buffers holds the result. `places`: the values are 0, 1, 2, ... and need not be written.
-    pub fn sort(&self, gpu: &Gpu, passes: &mut Passes, buffers: &SortBuffers, status: &Buffer, n_bits: u32, places: bool) -> usize {
+    pub fn sort(
+        &self,
+        gpu: &Gpu,
+        passes: &mut Passes,
+        buffers: &SortBuffers,
+        status: &Buffer,
+        n_bits: u32,
+        places: bool,
+    ) -> usize {
         let n_passes = n_bits.div_ceil(8) as usize;
         let n_groups = if self.parallel { buffers.max_blocks } else { buffers.max_blocks.div_ceil(8) };
         for (pass, digit) in buffers.digits[..n_passes].iter().enumerate() {
@@ -134,7 +144,7 @@ mod tests {
     fn sorted_on_gpu(keys: &[u32], n_bits: u32, parallel: bool) -> Option<(Vec<u32>, Vec<u32>)> {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
         if parallel && gpu.optional().subgroup_lanes.is_none_or(|lanes| lanes < 16) {
-            println!("skipped: the adapter has no subgroups of 16 or more");
+            eprintln!("skipped: the adapter has no subgroups of 16 or more");
             return None;
         }
         let sort = RadixSort::of_form(&gpu, parallel).unwrap();
@@ -150,11 +160,16 @@ mod tests {
 
     fn check(n: u32, n_bits: u32, parallel: bool) {
         let mask = if n_bits == 32 { u32::MAX } else { (1 << n_bits) - 1 };
-        let keys: Vec<u32> = (0..n).map(|i| i.wrapping_mul(2_654_435_761).rotate_left(7) & mask & 0xf0ff_f0ff).collect();
+        let keys: Vec<u32> =
+            (0..n).map(|i| i.wrapping_mul(2_654_435_761).rotate_left(7) & mask & 0xf0ff_f0ff).collect();
         let mut expected: Vec<(u32, u32)> = keys.iter().copied().zip(0..).collect();
         expected.sort_by_key(|(key, _)| *key); // Stable, as the GPU's must be.
         if let Some((sorted, places)) = sorted_on_gpu(&keys, n_bits, parallel) {
-            assert_eq!(sorted.into_iter().zip(places).collect::<Vec<_>>(), expected, "{n} keys of {n_bits} bits, parallel {parallel}");
+            assert_eq!(
+                sorted.into_iter().zip(places).collect::<Vec<_>>(),
+                expected,
+                "{n} keys of {n_bits} bits, parallel {parallel}"
+            );
         }
     }
 

@@ -1,9 +1,10 @@
 //! The kernels against their f64 twin: pictures, gradients, and what hostile input does.
+#![expect(clippy::needless_range_loop, reason = "channels and axes index several arrays at once")]
 
 use super::arrays::SplatArrays;
 use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_tiles};
 use super::kernels::{DrawPipelines, LearnPipelines};
-use super::params::{Camera, Rule, Supervision, status};
+use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
 use super::reference::{self, RenderedImage, Splat, Upstream, View, scene};
 use crate::Shutter;
@@ -40,7 +41,10 @@ fn arrays_of(splats: &[Splat]) -> SplatArrays {
         log_scales: splats.iter().map(|splat| f(splat.log_scale)).collect(),
         rotations_wxyz: splats.iter().map(|splat| splat.rotation_wxyz.map(f32_of)).collect(),
         opacity_logits: splats.iter().map(|splat| f32_of(splat.opacity_logit)).collect(),
-        sh: splats.iter().flat_map(|splat| (0..16).map(|ix| splat.sh.get(ix).map_or([0.0; 3], |rgb| f(*rgb)))).collect(),
+        sh: splats
+            .iter()
+            .flat_map(|splat| (0..16).map(|ix| splat.sh.get(ix).map_or([0.0; 3], |rgb| f(*rgb))))
+            .collect(),
         sh_degree: 3,
     }
 }
@@ -56,6 +60,7 @@ fn camera_of(view: &View) -> Camera {
         near_m: view.near_m,
         far_m: 1e6,
         crop: None,
+        low_pass_px2: LOW_PASS_PX2,
     }
 }
 
@@ -68,7 +73,9 @@ impl Bench {
         let mut splats = SplatBuffers::new(&gpu, n_splats, 3).unwrap();
         splats.append(&gpu, arrays);
         let tiles = n_tiles(view.size_px);
-        let scratch = Scratch::new(&gpu, &draw, ScratchSize { n_splats, n_isect: 1 << 14, n_buckets: 1 << 10, n_tiles: tiles }).unwrap();
+        let scratch =
+            Scratch::new(&gpu, &draw, ScratchSize { n_splats, n_isect: 1 << 14, n_buckets: 1 << 10, n_tiles: tiles })
+                .unwrap();
         let frame = Frame::new(&gpu, view.size_px[0] * view.size_px[1], tiles, true).unwrap();
         let mut counters = [0u32; status::LEN];
         counters[status::N_SPLATS as usize] = n_splats;
@@ -104,8 +111,12 @@ fn forms() -> [GpuOptions; 2] {
 }
 
 fn clear_pixels(view: &View, splats: &[Splat]) -> Vec<bool> {
-    let clear: Vec<bool> = reference::rasterize::threshold_margins(view, splats).iter().map(|margin| *margin > MARGIN).collect();
-    assert!(clear.iter().filter(|clear| **clear).count() * 10 > clear.len() * 9, "the scene hides too much behind thresholds");
+    let clear: Vec<bool> =
+        reference::rasterize::threshold_margins(view, splats).iter().map(|margin| *margin > MARGIN).collect();
+    assert!(
+        clear.iter().filter(|clear| **clear).count() * 10 > clear.len() * 9,
+        "the scene hides too much behind thresholds"
+    );
     clear
 }
 
@@ -120,10 +131,22 @@ fn pictures_match_the_twin() {
         let mut wrong = Mismatches::default();
         for pixel in (0..image.len()).filter(|pixel| clear[*pixel]) {
             for channel in 0..3 {
-                wrong.check(&format!("pixel {pixel} channel {channel}"), image[pixel][channel].into(), expected.rgb[pixel][channel], COLOR_ABS, 0.0);
+                wrong.check(
+                    format!("pixel {pixel} channel {channel}"),
+                    image[pixel][channel].into(),
+                    expected.rgb[pixel][channel],
+                    COLOR_ABS,
+                    0.0,
+                );
             }
-            wrong.check(&format!("transmittance {pixel}"), image[pixel][3].into(), expected.transmittance[pixel], COLOR_ABS, 0.0);
-            wrong.check(&format!("depth {pixel}"), depth[pixel].into(), expected.depth[pixel], 10.0 * COLOR_ABS, 0.0);
+            wrong.check(
+                format!("transmittance {pixel}"),
+                image[pixel][3].into(),
+                expected.transmittance[pixel],
+                COLOR_ABS,
+                0.0,
+            );
+            wrong.check(format!("depth {pixel}"), depth[pixel].into(), expected.depth[pixel], 10.0 * COLOR_ABS, 0.0);
         }
         wrong.assert_none();
     }
@@ -155,14 +178,26 @@ fn gradients_match_the_twin() {
             for (depth_m, clear) in target.depth_m.iter_mut().zip(&clear) {
                 *depth_m = if *clear { f64::from(f32_of(*depth_m)) } else { 0.0 };
             }
-            let weights = loss_reference::Weights { dssim_frac: 0.25, depth_per_m: 0.5, depth_clip_m: 50.0, background_rgb: [0.125, 0.25, 0.5] };
+            let weights = loss_reference::Weights {
+                dssim_frac: 0.25,
+                depth_per_m: 0.5,
+                depth_clip_m: 50.0,
+                background_rgb: [0.125, 0.25, 0.5],
+            };
             let (_, upstream) = loss_reference::loss(&rendered, &target, &weights);
             check_gradients(&options, &view, &splats, &target, &weights, &upstream);
         }
     }
 }
 
-fn check_gradients(options: &GpuOptions, view: &View, splats: &[Splat], target: &loss_reference::Target, weights: &loss_reference::Weights, upstream: &Upstream) {
+fn check_gradients(
+    options: &GpuOptions,
+    view: &View,
+    splats: &[Splat],
+    target: &loss_reference::Target,
+    weights: &loss_reference::Weights,
+    upstream: &Upstream,
+) {
     let expected = reference::render_backward(view, splats, upstream);
     let bench = Bench::new(options, view, &arrays_of(splats));
     let gpu = &bench.gpu;
@@ -189,7 +224,11 @@ fn check_gradients(options: &GpuOptions, view: &View, splats: &[Splat], target: 
     let mut passes = Passes::default();
     let view_passes = bench.passes();
     view_passes.draw(&mut passes, &bench.draw, &bench.learn.rasterize);
-    view_passes.compare(&mut passes, &bench.learn, &Target { image: &image, depth: &depth, supervision: &supervision, ssim: true });
+    view_passes.compare(
+        &mut passes,
+        &bench.learn,
+        &Target { image: &image, depth: &depth, supervision: &supervision, ssim: true },
+    );
     view_passes.backward(&mut passes, &bench.learn, &bench.draw);
     view_passes.update(&mut passes, &gradients_only, &rule);
     passes.submit(gpu);
@@ -199,15 +238,23 @@ fn check_gradients(options: &GpuOptions, view: &View, splats: &[Splat], target: 
     let largest = upstream.rgb.iter().flatten().fold(0.0f64, |most, value| most.max(value.abs()));
     for (pixel, slope) in slopes.iter().enumerate() {
         for channel in 0..3 {
-            wrong.check(&format!("upstream {pixel} {channel}"), slope[channel].into(), upstream.rgb[pixel][channel], 1e-3 * largest, 1e-3);
+            wrong.check(
+                format!("upstream {pixel} {channel}"),
+                slope[channel].into(),
+                upstream.rgb[pixel][channel],
+                1e-3 * largest,
+                1e-3,
+            );
         }
-        wrong.check(&format!("upstream depth {pixel}"), slope[3].into(), upstream.depth[pixel], 1e-9, 1e-5);
+        wrong.check(format!("upstream depth {pixel}"), slope[3].into(), upstream.depth[pixel], 1e-9, 1e-5);
     }
     wrong.assert_none();
 
     let got = bench.splats.read(gpu).unwrap();
     let mut wrong = Mismatches::default();
-    let largest = |of: fn(&Splat) -> Vec<f64>| expected.splats.iter().flat_map(of).fold(1e-12f64, |most, value| most.max(value.abs()));
+    let largest = |of: fn(&Splat) -> Vec<f64>| {
+        expected.splats.iter().flat_map(of).fold(1e-12f64, |most, value| most.max(value.abs()))
+    };
     let [mean, scale, rotation, opacity, sh] = [
         largest(|splat| splat.mean.to_vec()),
         largest(|splat| splat.log_scale.to_vec()),
@@ -217,18 +264,36 @@ fn check_gradients(options: &GpuOptions, view: &View, splats: &[Splat], target: 
     ];
     for (ix, splat) in expected.splats.iter().enumerate() {
         for axis in 0..3 {
-            wrong.check(&format!("mean {ix} {axis}"), got.means[ix][axis].into(), splat.mean[axis], GRADIENT_REL * mean, GRADIENT_REL);
-            wrong.check(&format!("log_scale {ix} {axis}"), got.log_scales[ix][axis].into(), splat.log_scale[axis], GRADIENT_REL * scale, GRADIENT_REL);
+            wrong.check(
+                format!("mean {ix} {axis}"),
+                got.means[ix][axis].into(),
+                splat.mean[axis],
+                GRADIENT_REL * mean,
+                GRADIENT_REL,
+            );
+            wrong.check(
+                format!("log_scale {ix} {axis}"),
+                got.log_scales[ix][axis].into(),
+                splat.log_scale[axis],
+                GRADIENT_REL * scale,
+                GRADIENT_REL,
+            );
         }
         for part in 0..4 {
             let (gpu, twin) = (got.rotations_wxyz[ix][part].into(), splat.rotation_wxyz[part]);
-            wrong.check(&format!("rotation {ix} {part}"), gpu, twin, GRADIENT_REL * rotation, GRADIENT_REL);
+            wrong.check(format!("rotation {ix} {part}"), gpu, twin, GRADIENT_REL * rotation, GRADIENT_REL);
         }
-        wrong.check(&format!("opacity {ix}"), got.opacity_logits[ix].into(), splat.opacity_logit, GRADIENT_REL * opacity, GRADIENT_REL);
+        wrong.check(
+            format!("opacity {ix}"),
+            got.opacity_logits[ix].into(),
+            splat.opacity_logit,
+            GRADIENT_REL * opacity,
+            GRADIENT_REL,
+        );
         for (coeff, rgb) in splat.sh.iter().enumerate() {
             for channel in 0..3 {
                 let gpu = got.sh[16 * ix + coeff][channel].into();
-                wrong.check(&format!("sh {ix} {coeff} {channel}"), gpu, rgb[channel], GRADIENT_REL * sh, GRADIENT_REL);
+                wrong.check(format!("sh {ix} {coeff} {channel}"), gpu, rgb[channel], GRADIENT_REL * sh, GRADIENT_REL);
             }
         }
     }

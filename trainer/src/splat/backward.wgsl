@@ -9,11 +9,12 @@
 //
 // rest = color . v_color + depth v_depth + transmittance v_transmittance of the finished pixel: what lies behind a splat is
 // that minus what lies in front, so one number a pixel travels from lane to lane beside the transmittance.
-// Lane l works on pixel i - l in round i. The state comes from lane l - 1 by SHUFFLE.
+// In round i lane l works on group i - l of PX pixels; the state comes from lane l - 1 (`handover`).
 
 #import view
 #import model
 #import projection
+#import pixels
 #import status
 
 struct Gradient {
@@ -40,11 +41,21 @@ struct Gradient {
 
 override LANES = 32u;
 const BUCKET = 32u;
-var<workgroup> wg_upstream: array<vec4f, 256>;
-var<workgroup> wg_state: array<vec2f, 256>;   // transmittance in front, rest still behind
-var<workgroup> wg_error: array<f32, 256>;
-var<workgroup> wg_last: array<u32, 256>;
+const GROUPS = 256u / PX;
+const GROUPS_PER_ROW = TILE_PX / PX;
+
+struct Pixels {
+    v_red: Px,
+    v_green: Px,
+    v_blue: Px,
+    v_depth: Px,
+    error: Px,
+    last: PxU,
+}
+
+var<workgroup> wg_pixels: array<Pixels, GROUPS>;
 #import handover
+var<workgroup> wg_states: array<State, GROUPS>;
 
 @compute @workgroup_size(LANES)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
@@ -53,73 +64,113 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     var first = 0u;
     var tile = 0u;
     var past_last = 0u;
+    var begin = 0u;
     if bucket < status[N_BUCKETS] && status[FAILED] == 0u {
         tile = bucket_tiles[bucket];
         let range = tile_ranges[tile];
+        begin = range.x;
         first = (bucket - bucket_starts[tile]) * BUCKET;
         n_in_tile = range.y - range.x;
         past_last = tile_last[tile];
     }
-    let range_begin = tile_ranges[tile].x;
     let reached = first < past_last;
     let corner = vec2u(tile % view.n_tiles.x, tile / view.n_tiles.x) * TILE_PX;
-    for (var i = lane; i < 256u; i += LANES) {
-        let pixel = corner + vec2u(i % TILE_PX, i / TILE_PX);
-        wg_last[i] = 0u;
-        if reached && pixel.x < view.size_px.x && pixel.y < view.size_px.y {
-            let at = pixel.y * view.size_px.x + pixel.x;
-            let front = bucket_color[bucket * 256u + i];
-            let slope = upstream[at];
-            wg_upstream[i] = slope;
-            wg_state[i] = vec2f(front.w, rest[at].x - dot(front.rgb, slope.rgb) - bucket_depth[bucket * 256u + i] * slope.w);
-            wg_error[i] = rest[at].y;
-            wg_last[i] = last[at];
+    for (var group = lane; group < GROUPS; group += LANES) {
+        var pixels: Pixels;
+        var state: State;
+        let place = corner + vec2u((group % GROUPS_PER_ROW) * PX, group / GROUPS_PER_ROW);
+        for (var k = 0u; k < PX; k++) {
+            if reached && place.x + k < view.size_px.x && place.y < view.size_px.y {
+                let at = place.y * view.size_px.x + place.x + k;
+                let front = bucket_color[bucket * 256u + group * PX + k];
+                let slope = upstream[at];
+                let end = rest[at];
+                pixels.v_red[k] = slope.x;
+                pixels.v_green[k] = slope.y;
+                pixels.v_blue[k] = slope.z;
+                pixels.v_depth[k] = slope.w;
+                pixels.error[k] = end.y;
+                pixels.last[k] = last[at];
+                state.transmittance[k] = front.w;
+                state.behind[k] = end.x - dot(front.rgb, slope.rgb) - bucket_depth[bucket * 256u + group * PX + k] * slope.w;
+            }
         }
+        wg_pixels[group] = pixels;
+        wg_states[group] = state;
     }
     workgroupBarrier(); // The tile's pixels are there.
 
     for (var part = 0u; part < BUCKET; part += LANES) {
         let rank = first + part + lane;   // of this lane's splat within the tile
         let owned = rank < n_in_tile;
-        var splat: Drawn;
-        if owned { splat = drawn[sorted_splats[range_begin + rank]]; }
-        var gradient: Gradient;
-        var state = vec2f(0.0);
-        for (var round = 0u; round < 255u + LANES; round++) {
-            state = handed_over(lane, round, state);
-            let i = round - lane; // Wraps past 256 before the lane's first pixel.
-            if i < 256u {
-                if lane == 0u { state = wg_state[i]; }
-                if owned && rank < wg_last[i] {
-                    let center_px = vec2f(corner + vec2u(i % TILE_PX, i / TILE_PX)) + 0.5;
-                    let offset = splat.place.xy - center_px;
-                    let power = 0.5 * (splat.conic.x * offset.x * offset.x + splat.conic.z * offset.y * offset.y) + splat.conic.y * offset.x * offset.y;
-                    let falloff = exp(-power);
-                    let unclamped = splat.place.w * falloff;
-                    let alpha = min(MAX_ALPHA, unclamped);
-                    if power >= 0.0 && alpha >= MIN_ALPHA {
-                        let slope = wg_upstream[i];
-                        let weight = alpha * state.x;
-                        let value = dot(splat.color.rgb, slope.rgb) + splat.place.z * slope.w;
-                        let behind = state.y - weight * value;
-                        let v_alpha = state.x * value - behind / (1.0 - alpha);
-                        gradient.color += weight * vec4f(slope.rgb, 1.0);
-                        gradient.place.z += weight * slope.w;
-                        gradient.conic.w += weight * wg_error[i];
-                        if unclamped <= MAX_ALPHA {
-                            let v_power = -alpha * v_alpha;
-                            gradient.place.w += falloff * v_alpha;
-                            gradient.conic += v_power * vec4f(0.5 * offset.x * offset.x, offset.x * offset.y, 0.5 * offset.y * offset.y, 0.0);
-                            gradient.place.x += v_power * (splat.conic.x * offset.x + splat.conic.y * offset.y);
-                            gradient.place.y += v_power * (splat.conic.y * offset.x + splat.conic.z * offset.y);
-                        }
-                        state = vec2f(state.x * (1.0 - alpha), behind);
+        var place = vec4f(0.0);
+        var conic = vec4f(0.0, 0.0, 0.0, -1.0); // Reaches nothing.
+        var color = vec3f(0.0);
+        if owned && reached {
+            let splat = drawn[sorted_splats[begin + rank]];
+            place = splat.place;
+            conic = splat.conic;
+            color = splat.color.rgb;
+        }
+        var v_x = Px(0.0);
+        var v_y = Px(0.0);
+        var v_z = Px(0.0);
+        var v_opacity = Px(0.0);
+        var v_a = Px(0.0);
+        var v_b = Px(0.0);
+        var v_c = Px(0.0);
+        var v_red = Px(0.0);
+        var v_green = Px(0.0);
+        var v_blue = Px(0.0);
+        var error = Px(0.0);
+        var state: State;
+        if reached { // The same for all lanes of the workgroup.
+            for (var round = 0u; round < GROUPS + LANES - 1u; round++) {
+                state = handed_over(lane, round, state);
+                let group = round - lane; // Wraps past GROUPS before the lane's first group.
+                if group < GROUPS {
+                    if lane == 0u { state = wg_states[group]; }
+                    let corner_px = vec2f(corner + vec2u((group % GROUPS_PER_ROW) * PX, group / GROUPS_PER_ROW)) + 0.5;
+                    let dx = place.x - corner_px.x - RAMP;
+                    let dy = place.y - corner_px.y;
+                    let power = 0.5 * (conic.x * dx * dx + conic.z * dy * dy) + conic.y * dy * dx;
+                    let hit = (PxU(rank) < wg_pixels[group].last) & (power >= Px(0.0)) & (power <= Px(0.5 * conic.w));
+                    if any(hit) {
+                        let falloff = select(Px(0.0), exp(-power), hit);
+                        let unclamped = place.w * falloff;
+                        let alpha = min(Px(MAX_ALPHA), unclamped);
+                        let weight = alpha * state.transmittance;
+                        let value = color.x * wg_pixels[group].v_red + color.y * wg_pixels[group].v_green + color.z * wg_pixels[group].v_blue + place.z * wg_pixels[group].v_depth;
+                        let behind = state.behind - weight * value;
+                        let v_alpha = state.transmittance * value - behind / (1.0 - alpha);
+                        v_red += weight * wg_pixels[group].v_red;
+                        v_green += weight * wg_pixels[group].v_green;
+                        v_blue += weight * wg_pixels[group].v_blue;
+                        v_z += weight * wg_pixels[group].v_depth;
+                        error += weight * wg_pixels[group].error;
+                        let v_free = select(v_alpha, Px(0.0), unclamped > Px(MAX_ALPHA));
+                        let v_power = -alpha * v_free;
+                        v_opacity += falloff * v_free;
+                        v_a += v_power * dx * dx;
+                        v_b += v_power * dx * dy;
+                        v_c += v_power * dy * dy;
+                        v_x += v_power * dx;
+                        v_y += v_power * dy;
+                        state = State(state.transmittance * (1.0 - alpha), behind);
                     }
+                    if LANES < BUCKET && lane == LANES - 1u { wg_states[group] = state; }
                 }
-                if lane == LANES - 1u { wg_state[i] = state; }
             }
         }
-        if owned { gradients[slots[range_begin + rank]] = gradient; }
+        if owned {
+            let x = dot(v_x, Px(1.0));
+            let y = dot(v_y, Px(1.0));
+            gradients[slots[begin + rank]] = Gradient(
+                vec4f(conic.x * x + conic.y * y, conic.y * x + conic.z * y, dot(v_z, Px(1.0)), dot(v_opacity, Px(1.0))),
+                vec4f(0.5 * dot(v_a, Px(1.0)), dot(v_b, Px(1.0)), 0.5 * dot(v_c, Px(1.0)), dot(error, Px(1.0))),
+                vec4f(dot(v_red, Px(1.0)), dot(v_green, Px(1.0)), dot(v_blue, Px(1.0)), 0.0),
+            );
+        }
         workgroupBarrier(); // The states behind this part are there for the next.
     }
 }

@@ -6,7 +6,7 @@
 use super::arrays::SplatArrays;
 use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_tiles};
 use super::kernels::{DrawPipelines, LearnPipelines};
-use super::params::{Camera, Rule, Supervision, status};
+use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
 use crate::Error;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, f32_of};
@@ -66,7 +66,12 @@ struct KernelBench {
 }
 
 /// Times the kernels on `cloud` at one image size.
-pub fn time_kernels(gpu: &Arc<Gpu>, cloud: &SplatArrays, size_px: [u32; 2], repeats: Repeats) -> Result<KernelFigures, Error> {
+pub fn time_kernels(
+    gpu: &Arc<Gpu>,
+    cloud: &SplatArrays,
+    size_px: [u32; 2],
+    repeats: Repeats,
+) -> Result<KernelFigures, Error> {
     let mut bench = KernelBench::new(gpu.clone(), cloud, size_px)?;
     bench.fit()?;
     let mut passes = Passes::default();
@@ -76,14 +81,24 @@ pub fn time_kernels(gpu: &Arc<Gpu>, cloud: &SplatArrays, size_px: [u32; 2], repe
     let (step_millis, step_wall_millis) = bench.time(&mut passes, repeats, KernelBench::list_step)?;
     bench.list_step(&mut passes);
     let timings = passes.submit_timed(gpu)?;
-    Ok(KernelFigures { n_isect, render_millis, step_millis, render_wall_millis, step_wall_millis, mean_rgb, peak_bytes: gpu.peak_bytes(), passes: timings })
+    Ok(KernelFigures {
+        n_isect,
+        render_millis,
+        step_millis,
+        render_wall_millis,
+        step_wall_millis,
+        mean_rgb,
+        peak_bytes: gpu.peak_bytes(),
+        passes: timings,
+    })
 }
 
 impl KernelBench {
     fn new(gpu: Arc<Gpu>, cloud: &SplatArrays, size_px: [u32; 2]) -> Result<Self, Error> {
         let draw = DrawPipelines::new(&gpu)?;
         let learn = LearnPipelines::new(&gpu)?;
-        let n_splats = u32::try_from(cloud.n_splats()).map_err(|_| Error::SplatArrays("more than 2^32 splats".to_owned()))?;
+        let n_splats =
+            u32::try_from(cloud.n_splats()).map_err(|_| Error::SplatArrays("more than 2^32 splats".to_owned()))?;
         let mut splats = SplatBuffers::new(&gpu, n_splats, cloud.sh_degree)?;
         splats.append(&gpu, cloud);
         let n_pixels = size_px[0] * size_px[1];
@@ -97,8 +112,11 @@ impl KernelBench {
             near_m: 0.01,
             far_m: 1e6,
             crop: None,
+            low_pass_px2: LOW_PASS_PX2,
         };
-        let noise: Vec<u32> = (0..n_pixels).map(|pixel| pixel.wrapping_mul(2_654_435_761).rotate_left(11).wrapping_mul(0x85eb_ca6b) | 0xff00_0000).collect();
+        let noise: Vec<u32> = (0..n_pixels)
+            .map(|pixel| pixel.wrapping_mul(2_654_435_761).rotate_left(11).wrapping_mul(0x85eb_ca6b) | 0xff00_0000)
+            .collect();
         let tiles = n_tiles(size_px);
         let first_guess = ScratchSize { n_splats, n_isect: 1 << 14, n_buckets: 1 << 10, n_tiles: tiles };
         let mut counters = [0u32; status::LEN];
@@ -135,7 +153,11 @@ impl KernelBench {
                 n_tiles: n_tiles(self.size_px),
             };
             drop(passes);
-            self.scratch = Scratch::new(&self.gpu, &self.draw, ScratchSize { n_splats: self.splats.n_splats, n_isect: 1, n_buckets: 1, n_tiles: 1 })?;
+            self.scratch = Scratch::new(
+                &self.gpu,
+                &self.draw,
+                ScratchSize { n_splats: self.splats.n_splats, n_isect: 1, n_buckets: 1, n_tiles: 1 },
+            )?;
             self.scratch = Scratch::new(&self.gpu, &self.draw, size)?;
             self.gpu.write(&self.status, 4 * status::FAILED as u64, &[0; 12]);
         }
@@ -161,7 +183,11 @@ impl KernelBench {
     fn list_step(&self, passes: &mut Passes) {
         let view = self.view_passes();
         view.draw(passes, &self.draw, &self.learn.rasterize);
-        view.compare(passes, &self.learn, &Target { image: &self.image, depth: &self.depth, supervision: &self.supervision, ssim: false });
+        view.compare(
+            passes,
+            &self.learn,
+            &Target { image: &self.image, depth: &self.depth, supervision: &self.supervision, ssim: false },
+        );
         view.backward(passes, &self.learn, &self.draw);
         view.update(passes, &self.learn.update, &self.rule);
         passes.dispatch(&self.gpu, &self.learn.advance, 1, &[("status", &self.status)]);

@@ -67,7 +67,11 @@ impl SplatBuffers {
         let (stride_from, stride_to) = (u64::from(self.capacity), u64::from(larger.capacity));
         for ((from, n_planes, bytes), (to, _, _)) in self.planes().iter().zip(larger.planes()) {
             for plane in 0..u64::from(*n_planes) {
-                gpu.copy((from, plane * stride_from * bytes), (to, plane * stride_to * bytes), u64::from(self.n_splats) * bytes);
+                gpu.copy(
+                    (from, plane * stride_from * bytes),
+                    (to, plane * stride_to * bytes),
+                    u64::from(self.n_splats) * bytes,
+                );
             }
         }
         larger.active_degree = self.active_degree;
@@ -107,14 +111,22 @@ impl SplatBuffers {
         gpu.write(&self.shapes, 16 * first, bytemuck::cast_slice(&shapes));
         let n_coeffs = arrays.n_coefficients();
         let plane = |function: usize, channel: usize| -> Vec<f32> {
-            arrays.sh.chunks_exact(n_coeffs).map(|coeffs| coeffs.get(function).map_or(0.0, |rgb| rgb[channel])).collect()
+            arrays
+                .sh
+                .chunks_exact(n_coeffs)
+                .map(|coeffs| coeffs.get(function).map_or(0.0, |rgb| rgb[channel]))
+                .collect()
         };
         let stride = u64::from(self.capacity);
         for channel in 0..3 {
             gpu.write(&self.sh_dc, 4 * (channel as u64 * stride + first), bytemuck::cast_slice(&plane(0, channel)));
         }
         for ix in 0..n_sh_rest(self.sh_degree) as usize {
-            gpu.write(&self.sh_rest, 4 * (ix as u64 * stride + first), bytemuck::cast_slice(&plane(1 + ix / 3, ix % 3)));
+            gpu.write(
+                &self.sh_rest,
+                4 * (ix as u64 * stride + first),
+                bytemuck::cast_slice(&plane(1 + ix / 3, ix % 3)),
+            );
         }
         let n_new = u32::try_from(n_new).expect("the caller has made room for u32 many");
         self.set_n(gpu, self.n_splats + n_new);
@@ -132,9 +144,18 @@ impl SplatBuffers {
         let rest: Vec<f32> = gpu.read(&self.sh_rest, n_rest * stride)?;
         let n_coeffs = 1 + n_rest / 3;
         let coeff = |ix: usize, function: usize| -> [f32; 3] {
-            std::array::from_fn(|channel| if function == 0 { dc[channel * stride + ix] } else { rest[(3 * (function - 1) + channel) * stride + ix] })
+            std::array::from_fn(|channel| {
+                if function == 0 {
+                    dc[channel * stride + ix]
+                } else {
+                    rest[(3 * (function - 1) + channel) * stride + ix]
+                }
+            })
         };
-        let sh = (0..n).flat_map(|ix| (0..n_coeffs).map(move |function| (ix, function))).map(|(ix, function)| coeff(ix, function)).collect();
+        let sh = (0..n)
+            .flat_map(|ix| (0..n_coeffs).map(move |function| (ix, function)))
+            .map(|(ix, function)| coeff(ix, function))
+            .collect();
         Ok(SplatArrays {
             means: means.iter().map(|[x, y, z, _]| [*x, *y, *z]).collect(),
             log_scales: shapes.iter().map(|[x, y, z, _]| [*x, *y, *z]).collect(),
@@ -165,7 +186,6 @@ impl SplatBuffers {
 /// What one view of the model needs while it is drawn, and learned from.
 #[derive(Debug)]
 pub(crate) struct Scratch {
-    pub(crate) n_splats: u32,
     pub(crate) n_isect: u32,
     pub(crate) n_buckets: u32,
     pub(crate) n_tile_bits: u32,
@@ -200,11 +220,13 @@ impl Scratch {
         let n_tile_bits = 32 - size.n_tiles.leading_zeros(); // One past the last tile is a key, too.
         let learned = if size.n_buckets == 0 { 0 } else { u64::from(size.n_isect) };
         Ok(Self {
-            n_splats: size.n_splats,
             n_isect: size.n_isect,
             n_buckets: size.n_buckets,
             n_tile_bits,
-            capacity: gpu.uniform_with("splat.capacity", &Capacity { n_isect: size.n_isect, n_buckets: size.n_buckets, unused: [0; 2] }),
+            capacity: gpu.uniform_with(
+                "splat.capacity",
+                &Capacity { n_isect: size.n_isect, n_buckets: size.n_buckets, unused: [0; 2] },
+            ),
             drawn: gpu.storage("splat.drawn", 48 * u64::from(size.n_splats))?,
             tile_counts: words("splat.tile_counts", size.n_splats)?,
             slot_offsets: words("splat.slot_offsets", size.n_splats)?,

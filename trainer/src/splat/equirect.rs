@@ -1,6 +1,10 @@
 //! Pictures of all directions, put together from the six faces of a cube.
+#![expect(
+    clippy::cast_possible_truncation,
+    reason = "pixels are rounded down on purpose, within image sizes that are u32"
+)]
 
-use super::params::Camera;
+use super::params::{Camera, LOW_PASS_PX2};
 use crate::{Error, Picture, RenderRequest};
 use kinematics::Transform;
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
@@ -10,11 +14,15 @@ use std::f64::consts::{FRAC_PI_2, PI};
 ///
 /// Longitude runs along x from -180 to 180 degrees, latitude along y from up to down; the camera's z axis is the middle.
 /// Depth is the distance from the camera's center, not along an axis.
-pub(crate) fn render(request: &RenderRequest, mut draw: impl FnMut(&Camera) -> Result<Picture, Error>) -> Result<Picture, Error> {
+pub(crate) fn render(
+    request: &RenderRequest,
+    mut draw: impl FnMut(&Camera) -> Result<Picture, Error>,
+) -> Result<Picture, Error> {
     let [width, height] = request.size_px;
     let edge = (width / 4).max(height / 2).max(1);
     let face = |turn: Rotation3<f64>| Camera {
-        world_from_camera: request.world_from_camera * Transform::from_parts(nalgebra::Translation3::identity(), UnitQuaternion::from_rotation_matrix(&turn)),
+        world_from_camera: request.world_from_camera
+            * Transform::from_parts(nalgebra::Translation3::identity(), UnitQuaternion::from_rotation_matrix(&turn)),
         size_px: [edge; 2],
         focal_px: [f64::from(edge) / 2.0; 2],
         principal_px: [f64::from(edge) / 2.0; 2],
@@ -22,6 +30,7 @@ pub(crate) fn render(request: &RenderRequest, mut draw: impl FnMut(&Camera) -> R
         near_m: request.near_m,
         far_m: request.far_m,
         crop: request.crop,
+        low_pass_px2: LOW_PASS_PX2,
     };
     let about = |axis, angle| Rotation3::from_axis_angle(&axis, angle);
     let turns = [
@@ -34,12 +43,14 @@ pub(crate) fn render(request: &RenderRequest, mut draw: impl FnMut(&Camera) -> R
     ];
     let faces: Vec<Picture> = turns.iter().map(|turn| draw(&face(*turn))).collect::<Result<_, _>>()?;
     let n = (width * height) as usize;
-    let mut picture = Picture { size_px: request.size_px, rgba_srgb: Vec::with_capacity(4 * n), depth_m: Vec::with_capacity(n) };
+    let mut picture =
+        Picture { size_px: request.size_px, rgba_srgb: Vec::with_capacity(4 * n), depth_m: Vec::with_capacity(n) };
     for y in 0..height {
         let latitude = FRAC_PI_2 - PI * (f64::from(y) + 0.5) / f64::from(height);
         for x in 0..width {
             let longitude = 2.0 * PI * (f64::from(x) + 0.5) / f64::from(width) - PI;
-            let direction = Vector3::new(latitude.cos() * longitude.sin(), -latitude.sin(), latitude.cos() * longitude.cos());
+            let direction =
+                Vector3::new(latitude.cos() * longitude.sin(), -latitude.sin(), latitude.cos() * longitude.cos());
             let (face_ix, in_face) = turns
                 .iter()
                 .map(|turn| turn.inverse() * direction)

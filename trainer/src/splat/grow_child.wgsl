@@ -2,7 +2,7 @@
 //
 // threads   one per splat up to n_after
 // reads     growth, cumulative, block_weights
-// writes    means, rotations, shapes, sh_dc, sh_rest, all moments of the child; n_children [n_before] (cleared before)
+// writes    means, rotations, shapes, sh_dc, sh_rest, all moments of the child; n_children [n_before] (cleared before), parents [n_after]
 //
 // A child is never a parent: dead splats weigh nothing and new ones have no weight, so nobody reads what is written here.
 
@@ -23,12 +23,14 @@
 @group(0) @binding(9) var<storage, read_write> sh_dc_moments: array<vec2f>;
 @group(0) @binding(10) var<storage, read_write> sh_rest_moments: array<vec2f>;
 @group(0) @binding(11) var<storage, read_write> n_children: array<atomic<u32>>;
+@group(0) @binding(12) var<storage, read_write> parents: array<u32>;
 
 override WG_SIZE = 256u;
 @compute @workgroup_size(WG_SIZE)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let child = folded(wg, n_wgs) * WG_SIZE + lane;
     if child >= growth.n_after { return; } // Allowed here: no barrier below.
+    parents[child] = NO_PARENT;
     if child < growth.n_before && !is_dead(means[child], shapes[child], growth.least_opacity) { return; }
     let n_blocks = (growth.n_before + 255u) / 256u;
     let total = block_weights[n_blocks - 1u];
@@ -58,13 +60,14 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         }
         return;
     }
+    parents[child] = parent;
     atomicAdd(&n_children[parent], 1u); // Integer sums: the order does not matter.
 
     let shape = shapes[parent];
     let offset = rotation_of(rotations[parent]) * (exp(shape.xyz) * clamp(normal3(vec3u(child, growth.key, 11u)), vec3f(-2.0), vec3f(2.0)));
     means[child] = means[parent] + vec4f(growth.child_spread * offset, 0.0);
     rotations[child] = rotations[parent];
-    shapes[child] = shape + vec4f(vec3f(growth.child_log_scale), 0.0);
+    shapes[child] = shape;
     for (var plane = 0u; plane < 6u; plane++) { moments[plane * growth.capacity + child] = vec4f(0.0); }
     for (var plane = 0u; plane < 3u; plane++) {
         sh_dc[plane * growth.capacity + child] = sh_dc[plane * growth.capacity + parent];

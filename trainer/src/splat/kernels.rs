@@ -4,33 +4,64 @@ use crate::Error;
 use crate::gpu::{Gpu, Kernel, Pipeline, Source};
 use crate::sort::RadixSort;
 
-macro_rules! shared {
-    ($($name:literal),*) => {
-        &[$(Source { name: $name, text: include_str!(concat!("../shared/", $name, ".wgsl")) }),*,
-          Source { name: "handover", text: include_str!("../shared/handover_subgroup.wgsl") }]
+macro_rules! source {
+    ($name:literal, $file:literal) => {
+        Source { name: $name, text: include_str!(concat!("../shared/", $file, ".wgsl")) }
+    };
+    ($name:literal) => {
+        source!($name, $name)
     };
 }
 
-const SHARED: &[Source] = shared!("view", "status", "projection", "tiles", "model", "sh", "scan", "random", "supervision", "growth", "scan_f32");
-const SHARED_WITHOUT_SUBGROUPS: &[Source] = &[
-    Source { name: "handover", text: include_str!("../shared/handover_memory.wgsl") },
-    SHARED[0],
-    SHARED[1],
-    SHARED[2],
-    SHARED[4],
+const VIEW: Source = source!("view");
+const STATUS: Source = source!("status");
+const MODEL: Source = source!("model");
+const PROJECTION: Source = source!("projection");
+const SHARED: &[Source] = &[
+    VIEW,
+    STATUS,
+    MODEL,
+    PROJECTION,
+    source!("tiles"),
+    source!("sh"),
+    source!("scan"),
+    source!("scan_f32"),
+    source!("random"),
+    source!("supervision"),
+    source!("growth"),
 ];
+/// What the kernels over pixels import: how many pixels a lane takes, and how a lane hears of the one below.
+const BLEND_2: &[Source] =
+    &[VIEW, STATUS, MODEL, PROJECTION, source!("pixels", "pixels_2"), source!("handover", "handover_subgroup")];
+const BLEND_4: &[Source] =
+    &[VIEW, STATUS, MODEL, PROJECTION, source!("pixels", "pixels_4"), source!("handover", "handover_subgroup")];
+const BLEND_4_BY_MEMORY: &[Source] =
+    &[VIEW, STATUS, MODEL, PROJECTION, source!("pixels", "pixels_4"), source!("handover", "handover_memory")];
 
 macro_rules! kernel {
     ($name:literal) => {
-        Kernel { source: Source { name: $name, text: include_str!(concat!($name, ".wgsl")) }, shared: SHARED }
+        kernel!($name, SHARED)
     };
-    ($folder:literal, $name:literal) => {
-        Kernel { source: Source { name: $name, text: include_str!(concat!("../", $folder, "/", $name, ".wgsl")) }, shared: SHARED }
+    ($name:literal, $shared:expr) => {
+        Kernel { source: Source { name: $name, text: include_str!(concat!($name, ".wgsl")) }, shared: $shared }
+    };
+    ($folder:literal, $name:literal, $shared:expr) => {
+        Kernel {
+            source: Source { name: $name, text: include_str!(concat!("../", $folder, "/", $name, ".wgsl")) },
+            shared: $shared,
+        }
     };
 }
 
-const BACKWARD: Kernel = kernel!("backward");
-const BACKWARD_WITHOUT_SUBGROUPS: Kernel = Kernel { source: BACKWARD.source, shared: SHARED_WITHOUT_SUBGROUPS };
+/// The kernels over pixels in the form that suits the adapter.
+fn blend_sources(gpu: &Gpu) -> &'static [Source] {
+    match gpu.optional().subgroup_lanes {
+        None => BLEND_4_BY_MEMORY,
+        // Wide subgroups idle while the first group travels through them: fewer pixels a lane, more rounds, less idling.
+        Some(lanes) if lanes >= 16 => BLEND_2,
+        Some(_) => BLEND_4,
+    }
+}
 
 /// All kernels of this module, for validation.
 pub const KERNELS: &[Kernel] = &[
@@ -40,18 +71,20 @@ pub const KERNELS: &[Kernel] = &[
     kernel!("emit"),
     kernel!("ranges"),
     kernel!("bucket_offsets"),
-    kernel!("rasterize"),
+    kernel!("rasterize", BLEND_2),
+    kernel!("rasterize", BLEND_4),
     kernel!("finish"),
-    kernel!("loss", "ssim"),
-    kernel!("loss", "loss_backward"),
-    BACKWARD,
-    BACKWARD_WITHOUT_SUBGROUPS,
+    kernel!("loss", "ssim", SHARED),
+    kernel!("loss", "loss_backward", SHARED),
+    kernel!("backward", BLEND_2),
+    kernel!("backward", BLEND_4),
+    kernel!("backward", BLEND_4_BY_MEMORY),
     kernel!("update"),
     kernel!("advance"),
     kernel!("grow_weigh"),
     kernel!("grow_scan"),
     kernel!("grow_child"),
-    kernel!("grow_parent"),
+    kernel!("grow_family"),
 ];
 
 /// What drawing needs.
@@ -78,7 +111,7 @@ impl DrawPipelines {
             emit: Pipeline::new(gpu, kernel!("emit"), &[])?,
             ranges: Pipeline::new(gpu, kernel!("ranges"), &[])?,
             bucket_offsets: Pipeline::new(gpu, kernel!("bucket_offsets"), &[])?,
-            rasterize: Pipeline::new(gpu, kernel!("rasterize"), &[("STATES", 0.0)])?,
+            rasterize: Pipeline::new(gpu, kernel!("rasterize", blend_sources(gpu)), &[("STATES", 0.0)])?,
             finish: Pipeline::new(gpu, kernel!("finish"), &[])?,
         })
     }
@@ -97,25 +130,24 @@ pub(crate) struct LearnPipelines {
     pub(crate) grow_weigh: Pipeline,
     pub(crate) grow_scan: Pipeline,
     pub(crate) grow_child: Pipeline,
-    pub(crate) grow_parent: Pipeline,
+    pub(crate) grow_family: Pipeline,
 }
 
 impl LearnPipelines {
     pub(crate) fn new(gpu: &Gpu) -> Result<Self, Error> {
-        let lanes = gpu.optional().subgroup_lanes.filter(|lanes| *lanes <= 32);
-        let (backward, lanes) = lanes.map_or((BACKWARD_WITHOUT_SUBGROUPS, 32), |lanes| (BACKWARD, lanes));
+        let lanes = gpu.optional().subgroup_lanes.unwrap_or(32).min(32);
         Ok(Self {
-            rasterize: Pipeline::new(gpu, kernel!("rasterize"), &[("STATES", 1.0)])?,
-            ssim: Pipeline::new(gpu, kernel!("loss", "ssim"), &[])?,
-            loss: Pipeline::new(gpu, kernel!("loss", "loss_backward"), &[("SSIM", 1.0)])?,
-            loss_without_ssim: Pipeline::new(gpu, kernel!("loss", "loss_backward"), &[("SSIM", 0.0)])?,
-            backward: Pipeline::new(gpu, backward, &[("LANES", lanes.into())])?,
+            rasterize: Pipeline::new(gpu, kernel!("rasterize", blend_sources(gpu)), &[("STATES", 1.0)])?,
+            ssim: Pipeline::new(gpu, kernel!("loss", "ssim", SHARED), &[])?,
+            loss: Pipeline::new(gpu, kernel!("loss", "loss_backward", SHARED), &[("SSIM", 1.0)])?,
+            loss_without_ssim: Pipeline::new(gpu, kernel!("loss", "loss_backward", SHARED), &[("SSIM", 0.0)])?,
+            backward: Pipeline::new(gpu, kernel!("backward", blend_sources(gpu)), &[("LANES", lanes.into())])?,
             update: Pipeline::new(gpu, kernel!("update"), &[])?,
             advance: Pipeline::new(gpu, kernel!("advance"), &[])?,
             grow_weigh: Pipeline::new(gpu, kernel!("grow_weigh"), &[])?,
             grow_scan: Pipeline::new(gpu, kernel!("grow_scan"), &[])?,
             grow_child: Pipeline::new(gpu, kernel!("grow_child"), &[])?,
-            grow_parent: Pipeline::new(gpu, kernel!("grow_parent"), &[])?,
+            grow_family: Pipeline::new(gpu, kernel!("grow_family"), &[])?,
         })
     }
 
@@ -134,7 +166,11 @@ mod tests {
     fn every_kernel_parses_and_validates() {
         let kernels = super::KERNELS.iter().chain(crate::sort::KERNELS);
         let refused: Vec<String> = kernels
-            .filter_map(|kernel| resolve(kernel.source, kernel.shared).and_then(|text| reflect(kernel.source.name, &text).map(|_| ())).err())
+            .filter_map(|kernel| {
+                resolve(kernel.source, kernel.shared)
+                    .and_then(|text| reflect(kernel.source.name, &text).map(|_| ()))
+                    .err()
+            })
             .map(|error| error.to_string())
             .collect();
         assert!(refused.is_empty(), "{}", refused.join("\n"));

@@ -17,21 +17,25 @@ pub struct SplatOptions {
     pub dssim_frac: f64,
     /// Weight of the depth loss, per metre.
     pub depth_per_m: f64,
-    /// Steps at a quarter of the resolution, and past which step the full one is used.
-    pub coarse_steps: [u64; 2],
+    /// Steps at a quarter of the resolution, and past which step the full one is used; `None`: few on a GPU, many on a
+    /// processor, where a step takes as long as the image has pixels.
+    pub coarse_steps: Option<[u64; 2]>,
+    /// Splats that one depth image may add; `None`: fewer on a processor.
+    pub seeds_per_image: Option<f64>,
 }
 
 impl Default for SplatOptions {
     fn default() -> Self {
         Self {
             seed: 0,
-            max_splats: 200_000,
+            max_splats: 400_000,
             max_bytes: None,
             sh_degree: 3,
             n_planned_steps: 7000,
             dssim_frac: 0.2,
             depth_per_m: 0.1,
-            coarse_steps: [150, 400],
+            coarse_steps: None,
+            seeds_per_image: None,
         }
     }
 }
@@ -47,14 +51,5 @@ impl SplatOptions {
     pub(crate) fn cap(&self) -> u32 {
         let by_bytes = self.max_bytes.map_or(u64::MAX, |bytes| bytes / self.bytes_per_splat());
         self.max_splats.min(u32::try_from(by_bytes).unwrap_or(u32::MAX)).max(1)
-    }
-
-    /// How many times smaller than full size, as a power of two, images are at a step.
-    pub(crate) fn level_at(&self, step: u64) -> u32 {
-        match step {
-            step if step < self.coarse_steps[0] => 2,
-            step if step < self.coarse_steps[1] => 1,
-            _ => 0,
-        }
     }
 }

@@ -35,7 +35,12 @@ pub(crate) struct Camera {
     pub(crate) near_m: f64,
     pub(crate) far_m: f64,
     pub(crate) crop: Option<Aabb>,
+    /// Variance added to every splat on the image plane, pixels squared.
+    pub(crate) low_pass_px2: f64,
 }
+
+/// Variance of the low-pass at full size, pixels squared.
+pub(crate) const LOW_PASS_PX2: f64 = 0.3;
 
 impl Camera {
     /// The same camera with an image `2^level` times smaller; rows and columns left over at the edges are cut.
@@ -45,6 +50,7 @@ impl Camera {
             size_px: self.size_px.map(|size| (size >> level).max(1)),
             focal_px: self.focal_px.map(|focal| focal * share),
             principal_px: self.principal_px.map(|principal| principal * share),
+            low_pass_px2: self.low_pass_px2 * share * share, // The same width in the world: what is learned small is drawn large.
             ..self.clone()
         }
     }
@@ -61,7 +67,7 @@ impl Camera {
         let crop_w = if self.crop.is_some() { 1.0 } else { 0.0 };
         View {
             camera_rows: rows_of(&self.world_from_camera.inverse()),
-            center_in_world: with(center, 0.0),
+            center_in_world: with(center, f32_of(self.low_pass_px2)),
             focal_px: f32s_of(self.focal_px),
             principal_px: f32s_of(self.principal_px),
             size_px: self.size_px,
@@ -157,6 +163,6 @@ pub(crate) struct Growth {
     pub(crate) capacity: u32,
     pub(crate) n_sh_rest: u32,
     pub(crate) child_spread: f32,
-    pub(crate) child_log_scale: f32,
     pub(crate) least_opacity: f32,
+    pub(crate) unused: f32,
 }

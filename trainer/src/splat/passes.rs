@@ -34,10 +34,18 @@ pub(crate) struct GrowthBuffers {
     pub(crate) cumulative: Buffer,
     pub(crate) block_weights: Buffer,
     pub(crate) n_children: Buffer,
+    pub(crate) parents: Buffer,
 }
 
 /// Hands out children of the splats whose error is largest: to dead splats, and to new ones past `n_before`.
-pub(crate) fn grow(gpu: &Gpu, passes: &mut Passes, pipelines: &LearnPipelines, splats: &SplatBuffers, buffers: &GrowthBuffers, growth: &Growth) {
+pub(crate) fn grow(
+    gpu: &Gpu,
+    passes: &mut Passes,
+    pipelines: &LearnPipelines,
+    splats: &SplatBuffers,
+    buffers: &GrowthBuffers,
+    growth: &Growth,
+) {
     let blocks = |n: u32| u64::from(n.div_ceil(256));
     let uniform = ("growth", &buffers.growth);
     let weights = ("block_weights", &buffers.block_weights);
@@ -73,15 +81,17 @@ pub(crate) fn grow(gpu: &Gpu, passes: &mut Passes, pipelines: &LearnPipelines, s
             ("sh_dc_moments", &splats.sh_dc_moments),
             ("sh_rest_moments", &splats.sh_rest_moments),
             ("n_children", &buffers.n_children),
+            ("parents", &buffers.parents),
         ],
     );
     passes.dispatch(
         gpu,
-        &pipelines.grow_parent,
+        &pipelines.grow_family,
         blocks(growth.n_after),
         &[
             uniform,
             ("n_children", &buffers.n_children),
+            ("parents", &buffers.parents),
             ("shapes", &splats.shapes),
             ("moments", &splats.moments),
             ("error_sums", &splats.error_sums),
@@ -113,13 +123,23 @@ impl ViewPasses<'_> {
         );
         let half = pipelines.sort.sort(gpu, passes, &scratch.by_depth, status, 32, true);
         let by_depth = &scratch.by_depth.values[half];
-        let counted = [("model", &splats.model), ("by_depth", by_depth), ("tile_counts", &scratch.tile_counts), ("block_sums", &scratch.block_sums)];
+        let counted = [
+            ("model", &splats.model),
+            ("by_depth", by_depth),
+            ("tile_counts", &scratch.tile_counts),
+            ("block_sums", &scratch.block_sums),
+        ];
         passes.dispatch(gpu, &pipelines.count_blocks, n_blocks, &counted);
         passes.dispatch(
             gpu,
             &pipelines.scan_blocks,
             1,
-            &[("model", &splats.model), ("capacity", &scratch.capacity), ("block_sums", &scratch.block_sums), ("status", status)],
+            &[
+                ("model", &splats.model),
+                ("capacity", &scratch.capacity),
+                ("block_sums", &scratch.block_sums),
+                ("status", status),
+            ],
         );
         passes.dispatch(
             gpu,
@@ -213,7 +233,12 @@ impl ViewPasses<'_> {
     pub(crate) fn compare(&self, passes: &mut Passes, pipelines: &LearnPipelines, target: &Target<'_>) {
         let Self { gpu, frame, view, .. } = *self;
         let n_groups = u64::from(n_tiles(self.size_px));
-        let base = [("view", view), ("supervision", target.supervision), ("image", &frame.image), ("target_image", target.image)];
+        let base = [
+            ("view", view),
+            ("supervision", target.supervision),
+            ("image", &frame.image),
+            ("target_image", target.image),
+        ];
         if target.ssim {
             let mut buffers = base.to_vec();
             buffers.push(("slopes", &frame.slopes));
@@ -228,7 +253,12 @@ impl ViewPasses<'_> {
             ("rest", &frame.rest),
             ("errors", &frame.errors),
         ]);
-        passes.dispatch(gpu, if target.ssim { &pipelines.loss } else { &pipelines.loss_without_ssim }, n_groups, &buffers);
+        passes.dispatch(
+            gpu,
+            if target.ssim { &pipelines.loss } else { &pipelines.loss_without_ssim },
+            n_groups,
+            &buffers,
+        );
     }
 
     /// Carries the slopes from the pixels to the intersections.

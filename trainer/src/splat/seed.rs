@@ -1,4 +1,8 @@
 //! First splats: flat discs on what depth shows, or a cloud in the cameras' common view.
+#![expect(
+    clippy::cast_possible_truncation,
+    reason = "pixels, cells and draws are rounded down on purpose, within ranges checked beside them"
+)]
 
 use super::arrays::SplatArrays;
 use crate::gpu::{f32_of, f32s_of};
@@ -6,8 +10,6 @@ use crate::{DepthMap, Keyframe};
 use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
 use std::collections::HashSet;
 
-/// Discs one image may add.
-const SEEDS_PER_IMAGE: f64 = 20_000.0;
 /// Neighbours whose depths differ by more than this share lie on different surfaces.
 const EDGE_FRAC: f64 = 0.04;
 /// Standard deviation of a disc in spacings of the grid: neighbours overlap without blurring.
@@ -29,15 +31,20 @@ pub(crate) struct Seeder {
 
 impl Seeder {
     /// Discs for what this keyframe sees and nobody has seen at this fineness.
-    pub(crate) fn discs(&mut self, keyframe: &Keyframe, depth: &DepthMap, sh_degree: u32) -> SplatArrays {
+    pub(crate) fn discs(&mut self, keyframe: &Keyframe, depth: &DepthMap, n_most: f64, sh_degree: u32) -> SplatArrays {
         let mut seeds = Seeds::new(sh_degree);
         let [width, height] = depth.size_px;
-        let stride = ((f64::from(width) * f64::from(height) / SEEDS_PER_IMAGE).sqrt().round() as u32).max(1);
+        let stride = ((f64::from(width) * f64::from(height) / n_most).sqrt().round() as u32).max(1);
         let at = |x: u32, y: u32| f64::from(depth.depth_m[(y * width + x) as usize]);
         for y in (stride / 2..height).step_by(stride as usize) {
             for x in (stride / 2..width).step_by(stride as usize) {
                 let z = at(x, y);
-                if !(z > 0.0 && z.is_finite()) || x < stride || y < stride || x + stride >= width || y + stride >= height {
+                if !(z > 0.0 && z.is_finite())
+                    || x < stride
+                    || y < stride
+                    || x + stride >= width
+                    || y + stride >= height
+                {
                     continue;
                 }
                 let around = [at(x - stride, y), at(x + stride, y), at(x, y - stride), at(x, y + stride)];
@@ -53,13 +60,16 @@ impl Seeder {
                     continue;
                 }
                 let filled = |near: f64| if near > 0.0 { near } else { z };
-                let across = point_in_camera(x + stride, y, filled(around[1])) - point_in_camera(x - stride, y, filled(around[0]));
-                let down = point_in_camera(x, y + stride, filled(around[3])) - point_in_camera(x, y - stride, filled(around[2]));
+                let across = point_in_camera(x + stride, y, filled(around[1]))
+                    - point_in_camera(x - stride, y, filled(around[0]));
+                let down = point_in_camera(x, y + stride, filled(around[3]))
+                    - point_in_camera(x, y - stride, filled(around[2]));
                 let normal = across.cross(&down).try_normalize(1e-12).unwrap_or_else(Vector3::z);
                 let normal_in_world = depth.world_from_camera * normal;
                 // Seen at a slant the grid is wider apart on the surface.
                 let slant = (normal.dot(&here.normalize()).abs()).max(0.3);
-                let size = [SPREAD * spacing_m / slant.sqrt(), SPREAD * spacing_m / slant.sqrt(), THICKNESS * spacing_m];
+                let size =
+                    [SPREAD * spacing_m / slant.sqrt(), SPREAD * spacing_m / slant.sqrt(), THICKNESS * spacing_m];
                 seeds.push(&place, &normal_in_world, size, SEED_OPACITY, color);
             }
         }
@@ -131,7 +141,8 @@ fn color_at(keyframe: &Keyframe, place: &Point3<f64>) -> Option<[f64; 3]> {
     if point.z <= 0.0 {
         return None;
     }
-    let pixel = [0, 1].map(|axis| (keyframe.focal_px[axis] * point[axis] / point.z + keyframe.principal_px[axis]).floor());
+    let pixel =
+        [0, 1].map(|axis| (keyframe.focal_px[axis] * point[axis] / point.z + keyframe.principal_px[axis]).floor());
     let inside = (0..2).all(|axis| pixel[axis] >= 0.0 && pixel[axis] < f64::from(keyframe.size_px[axis]));
     let at = inside.then(|| 4 * (pixel[1] as usize * keyframe.size_px[0] as usize + pixel[0] as usize))?;
     let rgba = &keyframe.rgba_srgb[at..at + 4];
@@ -150,11 +161,15 @@ struct Seeds {
 
 impl Seeds {
     fn new(sh_degree: u32) -> Self {
-        Self { arrays: SplatArrays { sh_degree, ..SplatArrays::default() }, n_rest: ((sh_degree + 1) * (sh_degree + 1) - 1) as usize }
+        Self {
+            arrays: SplatArrays { sh_degree, ..SplatArrays::default() },
+            n_rest: ((sh_degree + 1) * (sh_degree + 1) - 1) as usize,
+        }
     }
 
     fn push(&mut self, place: &Point3<f64>, normal: &Vector3<f64>, size_m: [f64; 3], opacity: f64, color: [f64; 3]) {
-        let turn = Rotation3::rotation_between(&Vector3::z(), normal).unwrap_or_else(|| Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI));
+        let turn = Rotation3::rotation_between(&Vector3::z(), normal)
+            .unwrap_or_else(|| Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI));
         let rotation = UnitQuaternion::from_rotation_matrix(&turn);
         let arrays = &mut self.arrays;
         arrays.means.push(f32s_of(place.coords.into()));

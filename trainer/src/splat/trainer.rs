@@ -1,10 +1,11 @@
 //! The splat model as a [`Method`]: seeds, steps, growth, pictures.
+#![expect(clippy::cast_possible_truncation, reason = "counts derived from caps that are u32, and bits of a seed")]
 
 use super::arrays::SplatArrays;
 use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_sh_rest, n_tiles};
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::options::SplatOptions;
-use super::params::{Camera, Growth, Rule, Supervision, status};
+use super::params::{Camera, Growth, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{self, GrowthBuffers, Target, ViewPasses};
 use super::seed::{self, Seeder};
 use super::views::TrainView;
@@ -32,6 +33,13 @@ const MAX_STEPS_PER_SUBMIT: u64 = 64;
 /// Readings further than this from the rendered depth are outliers.
 const DEPTH_CLIP_M: f64 = 0.2;
 
+/// Place of a child within its parent, in standard deviations.
+const CHILD_SPREAD: f32 = 0.5;
+/// Opacity and size cost as much against the color loss as if this many images had seen a scene without them: the fewer
+/// images there are, the more must speak for a splat.
+const COST_IMAGES: f64 = 4.0;
+const COST_RANGE: [f64; 2] = [0.01, 0.1];
+
 /// 3D Gaussian splats that learn from keyframes.
 #[derive(Debug)]
 pub struct SplatTrainer {
@@ -50,13 +58,16 @@ pub struct SplatTrainer {
     plain: Buffer,
     passes: Passes,
     seeder: Seeder,
-    seeded: usize,
+    seeds_per_image: f64,
+    coarse_steps: [u64; 2],
     views: Vec<TrainView>,
     scene_size_m: f64,
+    has_depth: bool,
     step: u64,
     grown_at: u64,
     n_poisoned: u64,
     in_flight: Option<InFlight>,
+    idle_since: Instant,
     step_millis: f64,
 }
 
@@ -81,6 +92,7 @@ impl SplatTrainer {
         let for_learning = gpu.clone();
         let learn = Learn::Compiling(std::thread::spawn(move || LearnPipelines::new(&for_learning)));
         let zeros = [0u8; 4 * status::LEN];
+        let software = gpu.is_software();
         Ok(Self {
             draw,
             learn,
@@ -104,13 +116,16 @@ impl SplatTrainer {
             plain: gpu.uniform_with("splat.background", &<Supervision as bytemuck::Zeroable>::zeroed()),
             passes: Passes::default(),
             seeder: Seeder::default(),
-            seeded: 0,
+            seeds_per_image: options.seeds_per_image.unwrap_or(if software { 4_000.0 } else { 20_000.0 }),
+            coarse_steps: options.coarse_steps.unwrap_or(if software { [500, 4000] } else { [150, 400] }),
             views: Vec::new(),
             scene_size_m: 1.0,
+            has_depth: false,
             step: 0,
             grown_at: 0,
             n_poisoned: 0,
             in_flight: None,
+            idle_since: Instant::now(),
             step_millis: 0.0,
             gpu,
             options,
@@ -184,7 +199,8 @@ impl SplatTrainer {
 
     fn make_room(&mut self, n_splats: u32) -> Result<(), Error> {
         if n_splats > self.splats.capacity {
-            let capacity = n_splats.max(self.splats.capacity.saturating_mul(3) / 2).min(self.options.cap().max(n_splats));
+            let capacity =
+                n_splats.max(self.splats.capacity.saturating_mul(3) / 2).min(self.options.cap().max(n_splats));
             self.splats = self.splats.grown(&self.gpu, capacity)?;
             self.passes.forget_bindings();
         }
@@ -200,15 +216,15 @@ impl SplatTrainer {
     /// Seeds from keyframes with depth as they come; a cloud when there is none by the first step.
     fn seed_from(&mut self, keyframe: &Keyframe) -> Result<(), Error> {
         let Some(depth) = &keyframe.depth else { return Ok(()) };
-        let discs = self.seeder.discs(keyframe, depth, self.options.sh_degree);
-        self.seeded += discs.n_splats();
+        let discs = self.seeder.discs(keyframe, depth, self.seeds_per_image, self.options.sh_degree);
         self.add(&discs)
     }
 
     fn begin_learning(&mut self) -> Result<(), Error> {
         if self.splats.n_splats == 0 && !self.views.is_empty() {
             let keyframes: Vec<&Keyframe> = self.views.iter().map(|view| view.keyframe.as_ref()).collect();
-            let cloud = seed::random_cloud(&keyframes, self.options.seed, self.options.cap() as usize, self.options.sh_degree);
+            let cloud =
+                seed::random_cloud(&keyframes, self.options.seed, self.options.cap() as usize, self.options.sh_degree);
             self.add(&cloud)?;
         }
         Ok(())
@@ -228,6 +244,10 @@ impl SplatTrainer {
 
     fn write_rule(&self) {
         let size = f32_of(self.scene_size_m);
+        let cost = f32_of(
+            (COST_IMAGES / self.views.len().max(1) as f64).clamp(COST_RANGE[0], COST_RANGE[1])
+                / f64::from(self.splats.n_splats.max(1)),
+        );
         let rule = Rule {
             mean_rate_m: 1.6e-4 * size,
             log_scale_rate: 5e-3,
@@ -240,11 +260,11 @@ impl SplatTrainer {
             betas: [0.9, 0.999],
             epsilon: 1e-15,
             n_planned_steps: f32_of(self.options.n_planned_steps as f64),
-            opacity_cost: 0.01 / self.splats.n_splats.max(1) as f32,
-            scale_cost: 0.01 / self.splats.n_splats.max(1) as f32,
+            opacity_cost: cost,
+            scale_cost: cost,
             log_scale_range: [(1e-5 * size).ln(), (2.0 * size).ln()],
             seed: (self.options.seed ^ (self.options.seed >> 32)) as u32,
-            update_all: 0,
+            update_all: u32::from(!self.has_depth),
             unused: [0; 2],
         };
         self.gpu.write(&self.rule, 0, bytemuck::bytes_of(&rule));
@@ -253,15 +273,30 @@ impl SplatTrainer {
     /// Lists the passes of one step.
     fn record_step(&mut self, learn: &LearnPipelines, step: u64) -> Result<(), Error> {
         let view_ix = pick(step, self.views.len(), self.options.seed);
-        let level_ix = self.options.level_at(step);
+        let level_ix = level_at(step, self.coarse_steps);
         let size_px = self.views[view_ix].level(&self.gpu, level_ix)?.size_px;
         let need = self.scratch_need(size_px, true);
         self.ensure_scratch(need)?;
         ensure_frame(&self.gpu, &mut self.learn_frame, &mut self.passes, size_px, true)?;
         let level = self.views[view_ix].level(&self.gpu, level_ix)?;
-        let (Some((_, scratch)), Some(frame)) = (&self.scratch, &self.learn_frame) else { return Err(Error::DeviceLost) };
-        let view = ViewPasses { gpu: &self.gpu, splats: &self.splats, scratch, frame, status: &self.learn_status, view: &level.view, size_px };
-        let target = Target { image: &level.image, depth: &level.depth, supervision: &self.supervision, ssim: self.options.dssim_frac > 0.0 };
+        let (Some((_, scratch)), Some(frame)) = (&self.scratch, &self.learn_frame) else {
+            return Err(Error::DeviceLost);
+        };
+        let view = ViewPasses {
+            gpu: &self.gpu,
+            splats: &self.splats,
+            scratch,
+            frame,
+            status: &self.learn_status,
+            view: &level.view,
+            size_px,
+        };
+        let target = Target {
+            image: &level.image,
+            depth: &level.depth,
+            supervision: &self.supervision,
+            ssim: self.options.dssim_frac > 0.0,
+        };
         view.draw(&mut self.passes, &self.draw, &learn.rasterize);
         view.compare(&mut self.passes, learn, &target);
         view.backward(&mut self.passes, learn, &self.draw);
@@ -280,7 +315,10 @@ impl SplatTrainer {
     fn ensure_scratch(&mut self, need: ScratchSize) -> Result<(), Error> {
         let have = self.scratch.as_ref().map(|(size, _)| *size);
         let fits = have.is_some_and(|have| {
-            have.n_splats >= need.n_splats && have.n_isect >= need.n_isect && have.n_buckets >= need.n_buckets && have.n_tiles >= need.n_tiles
+            have.n_splats >= need.n_splats
+                && have.n_isect >= need.n_isect
+                && have.n_buckets >= need.n_buckets
+                && have.n_tiles >= need.n_tiles
         });
         if fits {
             return Ok(());
@@ -320,7 +358,10 @@ impl SplatTrainer {
     fn settle(&mut self) -> Result<(), Error> {
         let Some(in_flight) = self.in_flight.take() else { return Ok(()) };
         let counters: Vec<u32> = in_flight.status.finish(&self.gpu)?;
-        let millis = in_flight.since.elapsed().as_secs_f64() * 1e3 / in_flight.n_steps.max(1) as f64;
+        let done = Instant::now();
+        let began = in_flight.since.max(self.idle_since); // The submit before was still running when this one was sent.
+        self.idle_since = done;
+        let millis = (done - began).as_secs_f64() * 1e3 / in_flight.n_steps.max(1) as f64;
         self.step_millis = if self.step_millis == 0.0 { millis } else { 0.8 * self.step_millis + 0.2 * millis };
         self.n_poisoned = u64::from(counters[status::N_POISONED]);
         if self.mend(&counters)? {
@@ -333,12 +374,15 @@ impl SplatTrainer {
     /// Changes the splat count when it is due: dead splats get new places, and there are more of them up to the cap.
     fn grow_when_due(&mut self, learn: &LearnPipelines) -> Result<(), Error> {
         let last = (GROWTH_END_FRAC * self.options.n_planned_steps as f64) as u64;
-        let due = self.step >= GROWTH_START && self.step < last && self.step % GROWTH_PERIOD == 0 && self.grown_at != self.step;
+        let due = self.step >= GROWTH_START
+            && self.step < last
+            && self.step.is_multiple_of(GROWTH_PERIOD)
+            && self.grown_at != self.step;
         if !due {
             return Ok(());
         }
         self.settle()?;
-        if self.step % GROWTH_PERIOD != 0 {
+        if !self.step.is_multiple_of(GROWTH_PERIOD) {
             return Ok(()); // The submit had failed; the change is due again when its steps are done.
         }
         self.grown_at = self.step;
@@ -352,9 +396,9 @@ impl SplatTrainer {
             key: (self.step as u32).wrapping_mul(0x9e37_79b9) ^ self.options.seed as u32,
             capacity: self.splats.capacity,
             n_sh_rest: n_sh_rest(self.splats.sh_degree),
-            child_spread: 0.8,
-            child_log_scale: -0.35,
+            child_spread: CHILD_SPREAD,
             least_opacity: 0.005,
+            unused: 0.0,
         };
         let words = |name: &str, n: u32| self.gpu.storage(name, 4 * u64::from(n));
         let buffers = GrowthBuffers {
@@ -362,6 +406,7 @@ impl SplatTrainer {
             cumulative: words("splat.cumulative", n_before)?,
             block_weights: words("splat.block_weights", n_before.div_ceil(256))?,
             n_children: words("splat.n_children", n_before)?,
+            parents: words("splat.parents", n_after)?,
         };
         passes::grow(&self.gpu, &mut self.passes, learn, &self.splats, &buffers, &growth);
         self.passes.submit(&self.gpu);
@@ -381,8 +426,18 @@ impl SplatTrainer {
             let need = self.scratch_need(size_px, false);
             self.ensure_scratch(need)?;
             ensure_frame(&self.gpu, &mut self.draw_frame, &mut self.passes, size_px, false)?;
-            let (Some((_, scratch)), Some(frame)) = (&self.scratch, &self.draw_frame) else { return Err(Error::DeviceLost) };
-            let passes = ViewPasses { gpu: &self.gpu, splats: &self.splats, scratch, frame, status: &self.draw_status, view: &view, size_px };
+            let (Some((_, scratch)), Some(frame)) = (&self.scratch, &self.draw_frame) else {
+                return Err(Error::DeviceLost);
+            };
+            let passes = ViewPasses {
+                gpu: &self.gpu,
+                splats: &self.splats,
+                scratch,
+                frame,
+                status: &self.draw_status,
+                view: &view,
+                size_px,
+            };
             passes.draw(&mut self.passes, &self.draw, &self.draw.rasterize);
             passes.finish(&mut self.passes, &self.draw, &self.plain);
             self.passes.submit(&self.gpu);
@@ -406,6 +461,7 @@ impl Method for SplatTrainer {
             return Ok(());
         }
         self.settle()?;
+        self.has_depth |= keyframe.depth.is_some();
         self.seed_from(&keyframe)?;
         self.views.push(TrainView::new(keyframe));
         self.measure_scene();
@@ -449,6 +505,10 @@ impl Method for SplatTrainer {
         Ok(n)
     }
 
+    fn prepare(&mut self) -> Result<(), Error> {
+        self.learn().map(drop)
+    }
+
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         match request.projection {
             Projection::Pinhole { focal_px, principal_px } => {
@@ -461,15 +521,23 @@ impl Method for SplatTrainer {
                     near_m: request.near_m,
                     far_m: request.far_m,
                     crop: request.crop,
+                    low_pass_px2: LOW_PASS_PX2,
                 };
                 self.draw_view(&camera, request.background_srgb)
             }
-            Projection::Equirectangular => super::equirect::render(request, |camera| self.draw_view(camera, request.background_srgb)),
+            Projection::Equirectangular => {
+                super::equirect::render(request, |camera| self.draw_view(camera, request.background_srgb))
+            }
         }
     }
 
     fn progress(&self) -> Progress {
-        Progress { step: self.step, primitives: self.splats.n_splats.into(), bytes: self.splats.bytes(), step_millis: self.step_millis }
+        Progress {
+            step: self.step,
+            primitives: self.splats.n_splats.into(),
+            bytes: self.splats.bytes(),
+            step_millis: self.step_millis,
+        }
     }
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {
@@ -482,7 +550,13 @@ impl Method for SplatTrainer {
     }
 }
 
-fn ensure_frame(gpu: &Gpu, frame: &mut Option<Frame>, passes: &mut Passes, size_px: [u32; 2], learned: bool) -> Result<(), Error> {
+fn ensure_frame(
+    gpu: &Gpu,
+    frame: &mut Option<Frame>,
+    passes: &mut Passes,
+    size_px: [u32; 2],
+    learned: bool,
+) -> Result<(), Error> {
     let (n_pixels, n_tiles) = (size_px[0] * size_px[1], n_tiles(size_px));
     if frame.as_ref().is_none_or(|frame| frame.n_pixels < n_pixels || frame.n_tiles < n_tiles) {
         let have = frame.as_ref().map_or((0, 0), |frame| (frame.n_pixels, frame.n_tiles));
@@ -492,6 +566,15 @@ fn ensure_frame(gpu: &Gpu, frame: &mut Option<Frame>, passes: &mut Passes, size_
         *frame = Some(Frame::new(gpu, n_pixels.max(have.0), n_tiles.max(have.1), learned)?);
     }
     Ok(())
+}
+
+/// How many times smaller than full size, as a power of two, images are at a step.
+fn level_at(step: u64, coarse_steps: [u64; 2]) -> u32 {
+    match step {
+        step if step < coarse_steps[0] => 2,
+        step if step < coarse_steps[1] => 1,
+        _ => 0,
+    }
 }
 
 /// Which view a step learns from: every view once in a shuffled order, then again in another.

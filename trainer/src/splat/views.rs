@@ -1,6 +1,10 @@
 //! Keyframes on the GPU, at the resolutions they are learned from.
+#![expect(
+    clippy::cast_possible_truncation,
+    reason = "pixels are rounded down on purpose, within image sizes that are u32"
+)]
 
-use super::params::Camera;
+use super::params::{Camera, LOW_PASS_PX2};
 use crate::gpu::{Buffer, Gpu, f32_of};
 use crate::{Error, Keyframe, Shutter};
 use nalgebra::Point3;
@@ -47,7 +51,8 @@ impl TrainView {
 impl Level {
     fn new(gpu: &Gpu, keyframe: &Keyframe, level: u32) -> Result<Self, Error> {
         let camera = camera_of(keyframe).at_level(level);
-        let (image, depth) = (shrunk_image(keyframe, camera.size_px, level), shrunk_depth(keyframe, camera.size_px, level));
+        let (image, depth) =
+            (shrunk_image(keyframe, camera.size_px, level), shrunk_depth(keyframe, camera.size_px, level));
         Ok(Self {
             size_px: camera.size_px,
             view: gpu.uniform_with("splat.view", &camera.view()),
@@ -68,6 +73,7 @@ pub(crate) fn camera_of(keyframe: &Keyframe) -> Camera {
         near_m: NEAR_M,
         far_m: FAR_M,
         crop: None,
+        low_pass_px2: LOW_PASS_PX2,
     }
 }
 
@@ -107,7 +113,10 @@ fn shrunk_depth(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Vec<f32> 
     }
     let width = keyframe.size_px[0] as usize;
     let (edge, middle) = (1usize << level, (1usize << level) / 2);
-    (0..size_px[1] as usize).flat_map(|y| (0..size_px[0] as usize).map(move |x| (x, y))).map(|(x, y)| full[(y * edge + middle) * width + x * edge + middle]).collect()
+    (0..size_px[1] as usize)
+        .flat_map(|y| (0..size_px[0] as usize).map(move |x| (x, y)))
+        .map(|(x, y)| full[(y * edge + middle) * width + x * edge + middle])
+        .collect()
 }
 
 /// Depth along the color camera's z for each of its pixels; empty where the keyframe has none.
@@ -115,7 +124,9 @@ fn shrunk_depth(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Vec<f32> 
 /// A depth camera with its own lens, pose or moment is carried over point by point; the nearest wins.
 fn depth_in_color_view(keyframe: &Keyframe) -> Vec<f32> {
     let Some(depth) = &keyframe.depth else { return Vec::new() };
-    let same_lens = depth.size_px == keyframe.size_px && depth.focal_px == keyframe.focal_px && depth.principal_px == keyframe.principal_px;
+    let same_lens = depth.size_px == keyframe.size_px
+        && depth.focal_px == keyframe.focal_px
+        && depth.principal_px == keyframe.principal_px;
     if same_lens && depth.world_from_camera == keyframe.world_from_camera {
         return depth.depth_m.to_vec();
     }

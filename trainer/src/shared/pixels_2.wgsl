@@ -1,0 +1,7 @@
+// pixels: 2 neighbours in a row, handled together by one lane.
+
+alias Px = vec2f;
+alias PxU = vec2u;
+alias PxB = vec2<bool>;
+const PX = 2u;
+const RAMP = Px(0.0, 1.0);

@@ -1,0 +1,7 @@
+// pixels: 4 neighbours in a row, handled together by one lane.
+
+alias Px = vec4f;
+alias PxU = vec4u;
+alias PxB = vec4<bool>;
+const PX = 4u;
+const RAMP = Px(0.0, 1.0, 2.0, 3.0);
