@@ -7,6 +7,9 @@ use crate::Error;
 use crate::gpu::{Buffer, Gpu};
 use crate::sort::SortBuffers;
 
+/// Bits of a depth key, as in project.wgsl.
+pub(crate) const DEPTH_BITS: u32 = 24;
+
 /// Floats of the spherical harmonics past the constant one.
 pub(crate) fn n_sh_rest(sh_degree: u32) -> u32 {
     3 * ((sh_degree + 1) * (sh_degree + 1) - 1)
@@ -231,7 +234,7 @@ impl Scratch {
             tile_counts: words("splat.tile_counts", size.n_splats)?,
             slot_offsets: words("splat.slot_offsets", size.n_splats)?,
             block_sums: words("splat.block_sums", size.n_splats.div_ceil(1024))?,
-            by_depth: pipelines.sort.buffers(gpu, "splat.by_depth", size.n_splats, 32, status::N_SPLATS)?,
+            by_depth: pipelines.sort.buffers(gpu, "splat.by_depth", size.n_splats, DEPTH_BITS, status::N_SPLATS)?,
             by_tile: pipelines.sort.buffers(gpu, "splat.by_tile", size.n_isect, n_tile_bits, status::N_ISECT)?,
             slot_splats: words("splat.slot_splats", size.n_isect)?,
             sorted_splats: words("splat.sorted_splats", size.n_isect)?,

@@ -1,6 +1,6 @@
 //! The stages of drawing and learning, as lists of passes.
 
-use super::buffers::{Frame, Scratch, SplatBuffers, n_tiles};
+use super::buffers::{DEPTH_BITS, Frame, Scratch, SplatBuffers, n_tiles};
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::params::Growth;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
@@ -121,7 +121,7 @@ impl ViewPasses<'_> {
                 ("tile_counts", &scratch.tile_counts),
             ],
         );
-        let half = pipelines.sort.sort(gpu, passes, &scratch.by_depth, status, 32, true);
+        let half = pipelines.sort.sort(gpu, passes, &scratch.by_depth, status, DEPTH_BITS, true);
         let by_depth = &scratch.by_depth.values[half];
         let counted = [
             ("model", &splats.model),

@@ -2,7 +2,7 @@
 //
 // threads   one per splat
 // reads     view, model, means, rotations, shapes, sh_dc, sh_rest
-// writes    drawn [n_splats], depth_keys [n_splats] (bits of z; all ones where unseen), tile_counts [n_splats]
+// writes    drawn [n_splats], depth_keys [n_splats] (24 bits; all ones where unseen), tile_counts [n_splats]
 // twin      splat/reference/project.rs
 // source    Zwicker et al. 2001 (EWA volume splatting); Kerbl et al. 2023, section 4
 
@@ -23,6 +23,7 @@
 @group(0) @binding(8) var<storage, read_write> depth_keys: array<u32>;
 @group(0) @binding(9) var<storage, read_write> tile_counts: array<u32>;
 
+const UNSEEN = 0xffffffu;
 override WG_SIZE = 256u;
 @compute @workgroup_size(WG_SIZE)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
@@ -32,7 +33,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let shape = shapes[splat_ix];
     let projection = project_splat(view, mean, rotations[splat_ix], shape.xyz);
     let opacity = sigmoid(shape.w);
-    depth_keys[splat_ix] = 0xffffffffu;
+    depth_keys[splat_ix] = UNSEEN;
     tile_counts[splat_ix] = 0u;
     // Written so that a NaN anywhere is not seen.
     let seen = projection.seen && opacity > MIN_ALPHA && projection.determinant > 0.0 && inside_crop(view, mean)
@@ -52,6 +53,9 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         color += basis[plane / 3u] * vec3f(sh_rest[at], sh_rest[at + model.capacity], sh_rest[at + 2u * model.capacity]);
     }
     drawn[splat_ix] = Drawn(vec4f(projection.mean_px, projection.point.z, opacity), vec4f(conic, reach), vec4f(max(color, vec3f(0.0)), 0.0));
-    depth_keys[splat_ix] = bitcast<u32>(projection.point.z);
+    // Positive floats order as their bits do. Counted from the near plane, without the last three, a millionth of the depth
+    // and sixteen octaves fit; what is further comes last, in the order of the splats.
+    let beyond_near = bitcast<u32>(projection.point.z) - bitcast<u32>(view.shutter_linear.w);
+    depth_keys[splat_ix] = min(beyond_near >> 3u, UNSEEN - 1u);
     tile_counts[splat_ix] = n_touched;
 }
