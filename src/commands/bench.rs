@@ -5,7 +5,6 @@ use clap::{Parser, Subcommand};
 use serde::Serialize;
 use std::io::Write;
 use std::path::PathBuf;
-use trainer::gpu::{Gpu, GpuOptions};
 use trainer::splat::arrays::SplatArrays;
 use trainer::splat::bench::{Repeats, time_kernels};
 use trainer::splat::cloud::{load_cloud_npz, synthetic_cloud};
@@ -83,7 +82,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     for (place, Size(size)) in args.size.iter().enumerate() {
         for n_splats in &counts {
             // A fresh device for each row, so that the peak of memory is the row's own.
-            let gpu = Gpu::open(&GpuOptions::default())?;
+            let gpu = super::open_gpu()?;
             if place == 0 && counts.first() == Some(n_splats) {
                 log::info!("{}", gpu.describe());
             }
