@@ -162,6 +162,33 @@ impl LearnPipelines {
 mod tests {
     use crate::gpu::{reflect, resolve};
 
+    /// Size in bytes of a struct as WGSL lays it out, in the first kernel that knows it.
+    fn span_in_wgsl(name: &str) -> usize {
+        let spans = super::KERNELS.iter().filter_map(|kernel| {
+            let module = reflect(kernel.source.name, &resolve(kernel.source, kernel.shared).unwrap()).unwrap();
+            module.types.iter().find_map(|(_, found)| match found.inner {
+                wgpu::naga::TypeInner::Struct { span, .. } if found.name.as_deref() == Some(name) => {
+                    Some(span as usize)
+                }
+                _ => None,
+            })
+        });
+        let spans: Vec<usize> = spans.collect();
+        assert!(spans.iter().all(|span| *span == spans[0]), "{name} differs between kernels: {spans:?}");
+        spans[0]
+    }
+
+    #[test]
+    fn structs_are_as_long_in_rust_as_in_wgsl() {
+        use crate::splat::params::{Capacity, Growth, Model, Rule, Supervision, View};
+        assert_eq!(size_of::<View>(), span_in_wgsl("View"));
+        assert_eq!(size_of::<Model>(), span_in_wgsl("Model"));
+        assert_eq!(size_of::<Rule>(), span_in_wgsl("Rule"));
+        assert_eq!(size_of::<Supervision>(), span_in_wgsl("Supervision"));
+        assert_eq!(size_of::<Growth>(), span_in_wgsl("Growth"));
+        assert_eq!(size_of::<Capacity>(), span_in_wgsl("Capacity") + 8, "uniform buffers are filled up to 16 bytes");
+    }
+
     #[test]
     fn every_kernel_parses_and_validates() {
         let kernels = super::KERNELS.iter().chain(crate::sort::KERNELS);
