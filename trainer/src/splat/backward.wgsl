@@ -16,12 +16,7 @@
 #import projection
 #import pixels
 #import status
-
-struct Gradient {
-    place: vec4f,      // mean_px.xy, depth, opacity
-    conic: vec4f,      // A, B, C; w: absolute error seen, weighted by contribution
-    color: vec4f,      // rgb; w: contribution, summed over pixels
-}
+#import gradient
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> status: array<u32>;

@@ -7,11 +7,7 @@
 #import view
 #import scan
 #import status
-
-struct Capacity {
-    n_isect: u32,
-    n_buckets: u32,
-}
+#import capacity
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> capacity: Capacity;

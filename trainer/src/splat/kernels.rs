@@ -17,6 +17,7 @@ const VIEW: Source = source!("view");
 const STATUS: Source = source!("status");
 const MODEL: Source = source!("model");
 const PROJECTION: Source = source!("projection");
+const GRADIENT: Source = source!("gradient");
 const SHARED: &[Source] = &[
     VIEW,
     STATUS,
@@ -29,14 +30,30 @@ const SHARED: &[Source] = &[
     source!("random"),
     source!("supervision"),
     source!("growth"),
+    source!("capacity"),
+    GRADIENT,
 ];
 /// What the kernels over pixels import: how many pixels a lane takes, and how a lane hears of the one below.
-const BLEND_2: &[Source] =
-    &[VIEW, STATUS, MODEL, PROJECTION, source!("pixels", "pixels_2"), source!("handover", "handover_subgroup")];
-const BLEND_4: &[Source] =
-    &[VIEW, STATUS, MODEL, PROJECTION, source!("pixels", "pixels_4"), source!("handover", "handover_subgroup")];
+const BLEND_2: &[Source] = &[
+    VIEW,
+    STATUS,
+    MODEL,
+    PROJECTION,
+    GRADIENT,
+    source!("pixels", "pixels_2"),
+    source!("handover", "handover_subgroup"),
+];
+const BLEND_4: &[Source] = &[
+    VIEW,
+    STATUS,
+    MODEL,
+    PROJECTION,
+    GRADIENT,
+    source!("pixels", "pixels_4"),
+    source!("handover", "handover_subgroup"),
+];
 const BLEND_4_BY_MEMORY: &[Source] =
-    &[VIEW, STATUS, MODEL, PROJECTION, source!("pixels", "pixels_4"), source!("handover", "handover_memory")];
+    &[VIEW, STATUS, MODEL, PROJECTION, GRADIENT, source!("pixels", "pixels_4"), source!("handover", "handover_memory")];
 
 macro_rules! kernel {
     ($name:literal) => {

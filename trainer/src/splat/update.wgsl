@@ -12,13 +12,8 @@
 #import projection
 #import sh
 #import status
+#import gradient
 #import random
-
-struct Gradient {
-    place: vec4f,      // mean_px.xy, depth, opacity
-    conic: vec4f,      // A, B, C; w: absolute error seen, weighted by contribution
-    color: vec4f,      // rgb; w: contribution, summed over pixels
-}
 
 struct Rule {
     rates: vec4f,          // of mean (metres), log_scale, rotation, opacity_logit

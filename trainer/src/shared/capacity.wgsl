@@ -1,0 +1,6 @@
+// capacity: how many intersections and buckets there is memory for.
+
+struct Capacity {
+    n_isect: u32,
+    n_buckets: u32,
+}
