@@ -300,6 +300,45 @@ fn check_gradients(
     wrong.assert_none();
 }
 
+/// A pile of opaque splats saturates its tile long before the list ends; what lies behind learns nothing from it, and in
+/// particular not what an earlier step left in its slots.
+#[test]
+fn hidden_splats_have_no_gradient() {
+    const N_SEEN: usize = 8;
+    let view = scene::tilted_view();
+    let world_from_camera = view.camera_from_world.inverse();
+    let size = view.size_px.map(|size| f64::from(size) / 2.0);
+    let mut pile = vec![scene::small_scene(6, 1)[0].clone(); 600];
+    for (ix, splat) in pile.iter_mut().enumerate() {
+        let z = 2.0 + 0.001 * ix as f64;
+        let on_axis = [0, 1].map(|axis| (size[axis] - view.principal_px[axis]) / view.focal_px[axis] * z);
+        splat.mean = (world_from_camera * nalgebra::Point3::new(on_axis[0], on_axis[1], z)).coords.into();
+        splat.log_scale = [3.0; 3]; // Far larger than the image.
+        splat.opacity_logit = 8.0;
+    }
+    for options in forms() {
+        let bench = Bench::new(&options, &view, &arrays_of(&pile));
+        let gpu = &bench.gpu;
+        let n_pixels = (view.size_px[0] * view.size_px[1]) as usize;
+        gpu.write(&bench.scratch.gradients, 0, bytemuck::cast_slice(&vec![1.0f32; 12 << 14]));
+        gpu.write(&bench.frame.upstream, 0, bytemuck::cast_slice(&vec![1.0f32; 4 * n_pixels]));
+        gpu.write(&bench.frame.rest, 0, bytemuck::cast_slice(&vec![1.0f32; 2 * n_pixels]));
+        let rule = gpu.uniform_with("rule", &<Rule as bytemuck::Zeroable>::zeroed());
+        let gradients_only = LearnPipelines::gradients_only(gpu).unwrap();
+        let mut passes = Passes::default();
+        let view_passes = bench.passes();
+        view_passes.draw(&mut passes, &bench.draw, &bench.learn.rasterize);
+        view_passes.backward(&mut passes, &bench.learn, &bench.draw);
+        view_passes.update(&mut passes, &gradients_only, &rule);
+        passes.submit(gpu);
+        let got = bench.splats.read(gpu).unwrap();
+        let learns = |ix: usize| got.sh[16 * ix].iter().any(|value| *value != 0.0);
+        assert!(learns(0), "the front splat is seen");
+        let late: Vec<usize> = (N_SEEN..pile.len()).filter(|ix| learns(*ix)).collect();
+        assert!(late.is_empty(), "hidden splats learn: {late:?}");
+    }
+}
+
 #[test]
 fn hostile_splats_are_not_seen_and_do_no_harm() {
     let view = scene::tilted_view();

@@ -33,27 +33,19 @@ const SHARED: &[Source] = &[
     source!("capacity"),
     GRADIENT,
 ];
-/// What the kernels over pixels import: how many pixels a lane takes, and how a lane hears of the one below.
-const BLEND_2: &[Source] = &[
-    VIEW,
-    STATUS,
-    MODEL,
-    PROJECTION,
-    GRADIENT,
-    source!("pixels", "pixels_2"),
-    source!("handover", "handover_subgroup"),
-];
-const BLEND_4: &[Source] = &[
-    VIEW,
-    STATUS,
-    MODEL,
-    PROJECTION,
-    GRADIENT,
-    source!("pixels", "pixels_4"),
-    source!("handover", "handover_subgroup"),
-];
+/// What the kernels over pixels import: how many pixels a lane takes, and how a lane hears of the others.
+macro_rules! blend_sources {
+    ($($source:expr),*) => {
+        &[VIEW, STATUS, MODEL, PROJECTION, GRADIENT, $($source),*]
+    };
+}
+const BLEND_2: &[Source] =
+    blend_sources!(source!("pixels", "pixels_2"), source!("handover", "handover_subgroup"));
+const BLEND_4: &[Source] =
+    blend_sources!(source!("pixels", "pixels_4"), source!("handover", "handover_subgroup"));
 const BLEND_4_BY_MEMORY: &[Source] =
-    &[VIEW, STATUS, MODEL, PROJECTION, GRADIENT, source!("pixels", "pixels_4"), source!("handover", "handover_memory")];
+    blend_sources!(source!("pixels", "pixels_4"), source!("handover", "handover_memory"));
+const BLEND_STRIPS: &[Source] = blend_sources!(source!("strips"));
 
 macro_rules! kernel {
     ($name:literal) => {
@@ -71,12 +63,30 @@ macro_rules! kernel {
 }
 
 /// The kernels over pixels in the form that suits the adapter.
-fn blend_sources(gpu: &Gpu) -> &'static [Source] {
+struct Blend {
+    rasterize: Kernel,
+    backward: Kernel,
+    /// Lanes of a workgroup of `backward`, where it leaves the choice.
+    lanes: Option<u32>,
+}
+
+fn blend(gpu: &Gpu) -> Blend {
+    let tiles = |shared, lanes: u32| Blend {
+        rasterize: kernel!("rasterize", shared),
+        backward: kernel!("backward", shared),
+        lanes: Some(lanes.min(32)),
+    };
     match gpu.optional().subgroup_lanes {
-        None => BLEND_4_BY_MEMORY,
+        None => tiles(BLEND_4_BY_MEMORY, 32),
+        // Software adapters: no processor made for pictures has subgroups of 8 and no other.
+        Some(8) => Blend {
+            rasterize: kernel!("rasterize_strips", BLEND_STRIPS),
+            backward: kernel!("backward_strips", BLEND_STRIPS),
+            lanes: None,
+        },
         // Wide subgroups idle while the first group travels through them: fewer pixels a lane, more rounds, less idling.
-        Some(lanes) if lanes >= 16 => BLEND_2,
-        Some(_) => BLEND_4,
+        Some(lanes) if lanes >= 16 => tiles(BLEND_2, lanes),
+        Some(lanes) => tiles(BLEND_4, lanes),
     }
 }
 
@@ -90,12 +100,14 @@ pub const KERNELS: &[Kernel] = &[
     kernel!("bucket_offsets"),
     kernel!("rasterize", BLEND_2),
     kernel!("rasterize", BLEND_4),
+    kernel!("rasterize_strips", BLEND_STRIPS),
     kernel!("finish"),
     kernel!("loss", "ssim", SHARED),
     kernel!("loss", "loss_backward", SHARED),
     kernel!("backward", BLEND_2),
     kernel!("backward", BLEND_4),
     kernel!("backward", BLEND_4_BY_MEMORY),
+    kernel!("backward_strips", BLEND_STRIPS),
     kernel!("update"),
     kernel!("advance"),
     kernel!("grow_weigh"),
@@ -128,7 +140,7 @@ impl DrawPipelines {
             emit: Pipeline::new(gpu, kernel!("emit"), &[])?,
             ranges: Pipeline::new(gpu, kernel!("ranges"), &[])?,
             bucket_offsets: Pipeline::new(gpu, kernel!("bucket_offsets"), &[])?,
-            rasterize: Pipeline::new(gpu, kernel!("rasterize", blend_sources(gpu)), &[("STATES", 0.0)])?,
+            rasterize: Pipeline::new(gpu, blend(gpu).rasterize, &[("STATES", 0.0)])?,
             finish: Pipeline::new(gpu, kernel!("finish"), &[])?,
         })
     }
@@ -152,13 +164,14 @@ pub(crate) struct LearnPipelines {
 
 impl LearnPipelines {
     pub(crate) fn new(gpu: &Gpu) -> Result<Self, Error> {
-        let lanes = gpu.optional().subgroup_lanes.unwrap_or(32).min(32);
+        let blend = blend(gpu);
+        let lanes: Vec<_> = blend.lanes.map(|lanes| ("LANES", f64::from(lanes))).into_iter().collect();
         Ok(Self {
-            rasterize: Pipeline::new(gpu, kernel!("rasterize", blend_sources(gpu)), &[("STATES", 1.0)])?,
+            rasterize: Pipeline::new(gpu, blend.rasterize, &[("STATES", 1.0)])?,
             ssim: Pipeline::new(gpu, kernel!("loss", "ssim", SHARED), &[])?,
             loss: Pipeline::new(gpu, kernel!("loss", "loss_backward", SHARED), &[("SSIM", 1.0)])?,
             loss_without_ssim: Pipeline::new(gpu, kernel!("loss", "loss_backward", SHARED), &[("SSIM", 0.0)])?,
-            backward: Pipeline::new(gpu, kernel!("backward", blend_sources(gpu)), &[("LANES", lanes.into())])?,
+            backward: Pipeline::new(gpu, blend.backward, &lanes)?,
             update: Pipeline::new(gpu, kernel!("update"), &[])?,
             advance: Pipeline::new(gpu, kernel!("advance"), &[])?,
             grow_weigh: Pipeline::new(gpu, kernel!("grow_weigh"), &[])?,

@@ -65,7 +65,11 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     var counted = !any(live);
     if counted { atomicAdd(&wg_n_done, 1u); }
     var bucket = 0u;
-    if STATES && in_grid { bucket = bucket_starts[tile]; }
+    if STATES && in_grid {
+        bucket = bucket_starts[tile];
+        // All of them, also those past the last contributor: their slots hold nothing until backward says so.
+        for (var i = lane; i < (n_splats + 31u) / 32u; i += LANES) { bucket_tiles[bucket + i] = tile; }
+    }
     for (var batch = 0u; batch < n_splats; batch += BATCH) {
         workgroupBarrier(); // All have counted themselves done, and read the last batch.
         if lane == 0u { wg_all_done = atomicLoad(&wg_n_done); }
@@ -82,7 +86,6 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
                     bucket_color[at * 256u + lane * PX + k] = vec4f(red[k], green[k], blue[k], transmittance[k]);
                     bucket_depth[at * 256u + lane * PX + k] = depth_sum[k];
                 }
-                if lane == 0u { bucket_tiles[at] = tile; }
             }
             if counted { continue; }
             let place = wg_drawn[i].place;

@@ -1,0 +1,45 @@
+// strips: a workgroup of 8 lanes, all of one subgroup, takes a tile in strips of two rows, 4 neighbouring pixels a lane.
+//
+// For software adapters: their lanes read memory one after the other, whoever needs the value, while a shuffle is one
+// instruction. So each lane reads one splat of eight, and the splats travel by shuffle. Branches cost both sides there;
+// only loops end early, so what does not reach a strip is left out of the loop over splats.
+
+const LANES = 8u;
+const N_STRIPS = 8u;
+
+alias Px = vec4f;
+alias PxU = vec4u;
+alias PxB = vec4<bool>;
+const PX = 4u;
+const RAMP = Px(0.0, 1.0, 2.0, 3.0);
+
+// Where in its tile the lane's first pixel of a strip lies.
+fn strip_px(strip: u32, lane: u32) -> vec2u {
+    return vec2u((lane & 3u) * PX, strip * 2u + (lane >> 2u));
+}
+
+// Whether a splat may reach the two rows whose first has its pixel centres at `top`; exact but for a margin that
+// outweighs the rounding of c - b b / a.
+fn reaches_strip(place: vec4f, conic: vec4f, top: f32) -> bool {
+    let dy = max(max(top - place.y, place.y - (top + 1.0)), 0.0);
+    let least = (conic.z - conic.y * conic.y / conic.x - 1e-5 * conic.z) * dy * dy;
+    return least <= conic.w;
+}
+
+fn or_of_lanes(mine: u32) -> u32 {
+    var all = mine | subgroupShuffleXor(mine, 1u);
+    all |= subgroupShuffleXor(all, 2u);
+    return all | subgroupShuffleXor(all, 4u);
+}
+
+fn max_of_lanes(mine: u32) -> u32 {
+    var all = max(mine, subgroupShuffleXor(mine, 1u));
+    all = max(all, subgroupShuffleXor(all, 2u));
+    return max(all, subgroupShuffleXor(all, 4u));
+}
+
+fn sum_of_lanes(mine: vec4f) -> vec4f {
+    var all = mine + subgroupShuffleXor(mine, 1u);
+    all += subgroupShuffleXor(all, 2u);
+    return all + subgroupShuffleXor(all, 4u);
+}
