@@ -95,16 +95,9 @@ impl RadixSort {
         })
     }
 
-    /// Sorts by the low `n_bits`; says which half of the buffers holds the result. `places`: the values are 0, 1, 2, ... and need not be written.
-    pub fn sort(
-        &self,
-        gpu: &Gpu,
-        passes: &mut Passes,
-        buffers: &SortBuffers,
-        status: &Buffer,
-        n_bits: u32,
-        places: bool,
-    ) -> usize {
+    /// Sorts by the low `n_bits`; says which half of the buffers holds the result. The values become the places the
+    /// keys had before: what they held does not matter.
+    pub fn sort(&self, gpu: &Gpu, passes: &mut Passes, buffers: &SortBuffers, status: &Buffer, n_bits: u32) -> usize {
         let n_passes = n_bits.div_ceil(8) as usize;
         let n_groups = if self.parallel { buffers.max_blocks } else { buffers.max_blocks.div_ceil(8) };
         for (pass, digit) in buffers.digits[..n_passes].iter().enumerate() {
@@ -112,7 +105,7 @@ impl RadixSort {
             let keys = &buffers.keys[from];
             let base: [(&str, &Buffer); 3] = [("digit", digit), ("status", status), ("counts", &buffers.counts)];
             passes.dispatch(gpu, &self.count, n_groups.into(), &[base[0], base[1], base[2], ("keys", keys)]);
-            let scatter = if places && pass == 0 { &self.scatter_places } else { &self.scatter };
+            let scatter = if pass == 0 { &self.scatter_places } else { &self.scatter };
             let mut scattered = vec![base[0], base[1], base[2], ("keys", keys), ("values", &buffers.values[from])];
             scattered.extend([("keys_out", &buffers.keys[to]), ("values_out", &buffers.values[to])]);
             if self.parallel {
@@ -153,7 +146,7 @@ mod tests {
         let status = gpu.storage_with("status", bytemuck::cast_slice(&[n])).unwrap();
         gpu.write(&buffers.keys[0], 0, bytemuck::cast_slice(keys));
         let mut passes = Passes::default();
-        let half = sort.sort(&gpu, &mut passes, &buffers, &status, n_bits, true);
+        let half = sort.sort(&gpu, &mut passes, &buffers, &status, n_bits);
         passes.submit(&gpu);
         Some((gpu.read(&buffers.keys[half], keys.len()).unwrap(), gpu.read(&buffers.values[half], keys.len()).unwrap()))
     }

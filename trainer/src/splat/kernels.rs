@@ -39,10 +39,8 @@ macro_rules! blend_sources {
         &[VIEW, STATUS, MODEL, PROJECTION, GRADIENT, $($source),*]
     };
 }
-const BLEND_2: &[Source] =
-    blend_sources!(source!("pixels", "pixels_2"), source!("handover", "handover_subgroup"));
-const BLEND_4: &[Source] =
-    blend_sources!(source!("pixels", "pixels_4"), source!("handover", "handover_subgroup"));
+const BLEND_2: &[Source] = blend_sources!(source!("pixels", "pixels_2"), source!("handover", "handover_subgroup"));
+const BLEND_4: &[Source] = blend_sources!(source!("pixels", "pixels_4"), source!("handover", "handover_subgroup"));
 const BLEND_4_BY_MEMORY: &[Source] =
     blend_sources!(source!("pixels", "pixels_4"), source!("handover", "handover_memory"));
 const BLEND_STRIPS: &[Source] = blend_sources!(source!("strips"));

@@ -121,7 +121,7 @@ impl ViewPasses<'_> {
                 ("tile_counts", &scratch.tile_counts),
             ],
         );
-        let half = pipelines.sort.sort(gpu, passes, &scratch.by_depth, status, DEPTH_BITS, true);
+        let half = pipelines.sort.sort(gpu, passes, &scratch.by_depth, status, DEPTH_BITS);
         let by_depth = &scratch.by_depth.values[half];
         let counted = [
             ("model", &splats.model),
@@ -154,12 +154,11 @@ impl ViewPasses<'_> {
                 ("block_sums", &scratch.block_sums),
                 ("status", status),
                 ("tile_keys", &scratch.by_tile.keys[0]),
-                ("slots", &scratch.by_tile.values[0]),
                 ("slot_splats", &scratch.slot_splats),
                 ("slot_offsets", &scratch.slot_offsets),
             ],
         );
-        let half = pipelines.sort.sort(gpu, passes, &scratch.by_tile, status, scratch.n_tile_bits, false);
+        let half = pipelines.sort.sort(gpu, passes, &scratch.by_tile, status, scratch.n_tile_bits);
         passes.clear(&frame.tile_ranges);
         passes.dispatch(
             gpu,
