@@ -27,6 +27,8 @@ const SH_0: f64 = 0.282_094_791_773_878_14;
 pub(crate) struct Seeder {
     /// Octave of the spacing, and the cell of that size.
     taken: HashSet<(i32, [i32; 3])>,
+    /// Where the discs lie, in world.
+    places: Vec<Point3<f64>>,
 }
 
 impl Seeder {
@@ -76,13 +78,107 @@ impl Seeder {
         seeds.arrays
     }
 
+    /// Discs for what a keyframe without depth sees and no disc covers, as far away as the discs around it in the image.
+    pub(crate) fn discs_without_depth(
+        &mut self,
+        keyframe: &Keyframe,
+        n_most: f64,
+        default_m: f64,
+        sh_degree: u32,
+    ) -> SplatArrays {
+        let mut seeds = Seeds::new(sh_degree);
+        let [width, height] = keyframe.size_px.map(f64::from);
+        let stride = (width * height / n_most).sqrt().round().max(1.0);
+        let n_cells = [width, height].map(|px| (px / stride).ceil() as usize);
+        let camera_from_world = keyframe.world_from_camera.inverse();
+        let mut seen = InverseDepths::new(n_cells);
+        for place in &self.places {
+            let point = camera_from_world * place;
+            let cell = [0, 1].map(|axis| {
+                let px = keyframe.focal_px[axis] * point[axis] / point.z + keyframe.principal_px[axis];
+                (px / stride).floor()
+            });
+            if point.z > 0.0 && (0..2).all(|axis| cell[axis] >= 0.0 && cell[axis] < n_cells[axis] as f64) {
+                seen.tell([cell[0] as usize, cell[1] as usize], 1.0 / point.z);
+            }
+        }
+        let filled = seen.filled(1.0 / default_m);
+        for row in 0..n_cells[1] {
+            for column in 0..n_cells[0] {
+                if seen.near([column, row]) {
+                    continue;
+                }
+                let px = [(column as f64 + 0.5) * stride, (row as f64 + 0.5) * stride];
+                let z = 1.0 / filled[row * n_cells[0] + column];
+                let ray = [0, 1].map(|axis| (px[axis] - keyframe.principal_px[axis]) / keyframe.focal_px[axis]);
+                let place = keyframe.world_from_camera * Point3::from(Vector3::new(ray[0], ray[1], 1.0) * z);
+                let Some(color) = color_at(keyframe, &place) else { continue };
+                let spacing_m = stride * z / keyframe.focal_px[0];
+                if !self.take(&place, spacing_m) {
+                    continue;
+                }
+                let towards = keyframe.world_from_camera.translation.vector - place.coords;
+                let size = [SPREAD * spacing_m, SPREAD * spacing_m, THICKNESS * spacing_m];
+                seeds.push(&place, &towards.normalize(), size, SEED_OPACITY, color);
+            }
+        }
+        seeds.arrays
+    }
+
     fn take(&mut self, place: &Point3<f64>, spacing_m: f64) -> bool {
         let octave = spacing_m.log2().round() as i32;
         let key = |octave: i32| (octave, std::array::from_fn(|axis| (place[axis] / 2f64.powi(octave)).floor() as i32));
         if [octave - 1, octave, octave + 1].iter().any(|octave| self.taken.contains(&key(*octave))) {
             return false;
         }
+        self.places.push(*place);
         self.taken.insert(key(octave))
+    }
+}
+
+/// Inverse depth per cell of an image, 0 where none is known.
+struct InverseDepths {
+    n_cells: [usize; 2],
+    per_m: Vec<f64>,
+}
+
+impl InverseDepths {
+    fn new(n_cells: [usize; 2]) -> Self {
+        Self { n_cells, per_m: vec![0.0; n_cells[0] * n_cells[1]] }
+    }
+
+    /// The nearest counts.
+    fn tell(&mut self, [column, row]: [usize; 2], per_m: f64) {
+        let known = &mut self.per_m[row * self.n_cells[0] + column];
+        *known = known.max(per_m);
+    }
+
+    /// Whether the cell or one of the eight around it is known.
+    fn near(&self, [column, row]: [usize; 2]) -> bool {
+        let rows = row.saturating_sub(1)..(row + 2).min(self.n_cells[1]);
+        rows.into_iter().any(|row| {
+            let columns = column.saturating_sub(1)..(column + 2).min(self.n_cells[0]);
+            self.per_m[row * self.n_cells[0]..][columns].iter().any(|per_m| *per_m > 0.0)
+        })
+    }
+
+    /// Unknown cells get the mean of the known ones of the smallest square of 2, 4, 8, ... cells that knows any.
+    fn filled(&self, default_per_m: f64) -> Vec<f64> {
+        let [width, height] = self.n_cells;
+        if width * height <= 1 {
+            return self.per_m.iter().map(|per_m| if *per_m > 0.0 { *per_m } else { default_per_m }).collect();
+        }
+        let mut coarse = Self::new([width.div_ceil(2), height.div_ceil(2)]);
+        for (ix, mean) in coarse.per_m.iter_mut().enumerate() {
+            let [column, row] = [2 * (ix % coarse.n_cells[0]), 2 * (ix / coarse.n_cells[0])];
+            let square = (row..(row + 2).min(height))
+                .flat_map(|row| (column..(column + 2).min(width)).map(move |column| row * width + column));
+            let known: Vec<f64> = square.map(|at| self.per_m[at]).filter(|per_m| *per_m > 0.0).collect();
+            *mean = known.iter().sum::<f64>() / known.len().max(1) as f64;
+        }
+        let around = coarse.filled(default_per_m);
+        let of_coarse = |ix: usize| around[ix / width / 2 * coarse.n_cells[0] + ix % width / 2];
+        self.per_m.iter().enumerate().map(|(ix, per_m)| if *per_m > 0.0 { *per_m } else { of_coarse(ix) }).collect()
     }
 }
 
@@ -191,5 +287,60 @@ impl Random {
         z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
         z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
         ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use kinematics::{Stamp, Transform};
+
+    const WALL_M: f64 = 2.0;
+
+    /// A grey wall ahead; the camera's image is `size_px` wide and high, its axis in the middle.
+    fn sees_wall(size_px: [u32; 2], with_depth: bool) -> Keyframe {
+        let principal_px = size_px.map(|px| f64::from(px) / 2.0);
+        let n = (size_px[0] * size_px[1]) as usize;
+        let world_from_camera = Transform::identity();
+        let depth_m = vec![f32_of(WALL_M); n].into();
+        let depth = DepthMap { size_px, focal_px: [100.0; 2], principal_px, depth_m, world_from_camera };
+        Keyframe {
+            camera: "test".into(),
+            stamp: Stamp(0),
+            size_px,
+            focal_px: [100.0; 2],
+            principal_px,
+            rgba_srgb: vec![255; 4 * n].into(),
+            depth: with_depth.then_some(depth),
+            world_from_camera,
+            twist: None,
+            readout_secs: 0.0,
+            split: crate::Split::Train,
+            truth: None,
+        }
+    }
+
+    #[test]
+    fn a_camera_without_depth_gets_discs_where_the_others_left_it_bare() {
+        let mut seeder = Seeder::default();
+        let near = sees_wall([100, 80], true);
+        let seen = seeder.discs(&near, near.depth.as_ref().unwrap(), 2000.0, 0);
+        assert!(seen.means.len() > 1000);
+        let wide = sees_wall([200, 80], false);
+        let bare = seeder.discs_without_depth(&wide, 4000.0, 7.0, 0);
+        // Half of the wide image is bare, but for a rim of a cell or two.
+        assert!((1500..=2100).contains(&bare.means.len()), "{} discs", bare.means.len());
+        for mean in &bare.means {
+            assert!((f64::from(mean[2]) - WALL_M).abs() < 1e-3, "as far away as the wall around: {mean:?}");
+            assert!(f64::from(mean[0]).abs() > 0.9, "outside of what the camera with depth saw: {mean:?}");
+        }
+        assert!(seeder.discs_without_depth(&wide, 4000.0, 7.0, 0).means.is_empty(), "a second look finds nothing bare");
+    }
+
+    #[test]
+    fn without_any_neighbour_a_disc_lies_at_the_default() {
+        let discs = Seeder::default().discs_without_depth(&sees_wall([40, 40], false), 100.0, 7.0, 0);
+        assert_eq!(discs.means.len(), 100);
+        assert!(discs.means.iter().all(|mean| (mean[2] - 7.0).abs() < 1e-4));
     }
 }

@@ -58,6 +58,8 @@ pub struct SplatTrainer {
     plain: Buffer,
     passes: Passes,
     seeder: Seeder,
+    /// Keyframes without depth since the last step.
+    unseeded: Vec<Arc<Keyframe>>,
     seeds_per_image: f64,
     coarse_steps: [u64; 2],
     views: Vec<TrainView>,
@@ -116,6 +118,7 @@ impl SplatTrainer {
             plain: gpu.uniform_with("splat.background", &<Supervision as bytemuck::Zeroable>::zeroed()),
             passes: Passes::default(),
             seeder: Seeder::default(),
+            unseeded: Vec::new(),
             seeds_per_image: options.seeds_per_image.unwrap_or(if software { 4_000.0 } else { 20_000.0 }),
             coarse_steps: options.coarse_steps.unwrap_or(if software { [500, 4000] } else { [150, 400] }),
             views: Vec::new(),
@@ -213,14 +216,26 @@ impl SplatTrainer {
         }
     }
 
-    /// Seeds from keyframes with depth as they come; a cloud when there is none by the first step.
-    fn seed_from(&mut self, keyframe: &Keyframe) -> Result<(), Error> {
-        let Some(depth) = &keyframe.depth else { return Ok(()) };
+    /// Seeds from keyframes with depth as they come; those without wait for the next step.
+    fn seed_from(&mut self, keyframe: &Arc<Keyframe>) -> Result<(), Error> {
+        let Some(depth) = &keyframe.depth else {
+            self.unseeded.push(keyframe.clone());
+            return Ok(());
+        };
         let discs = self.seeder.discs(keyframe, depth, self.seeds_per_image, self.options.sh_degree);
         self.add(&discs)
     }
 
+    /// Keyframes without depth get discs where those with depth left them bare; without any depth there is a cloud.
     fn begin_learning(&mut self) -> Result<(), Error> {
+        for keyframe in std::mem::take(&mut self.unseeded) {
+            if self.has_depth {
+                let (n_most, default_m) = (self.seeds_per_image, self.scene_size_m);
+                let sh_degree = self.options.sh_degree;
+                let discs = self.seeder.discs_without_depth(&keyframe, n_most, default_m, sh_degree);
+                self.add(&discs)?;
+            }
+        }
         if self.splats.n_splats == 0 && !self.views.is_empty() {
             let keyframes: Vec<&Keyframe> = self.views.iter().map(|view| view.keyframe.as_ref()).collect();
             let cloud =

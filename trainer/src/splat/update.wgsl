@@ -174,9 +174,10 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
 
     let step = f32(atomicLoad(&status[STEP]));
     correction = 1.0 / (1.0 - pow(rule.decay.xy, vec2f(step + 1.0)));
-    let fallen = pow(rule.sh_rates.w, min(step / max(rule.decay.w, 1.0), 1.0));
-    let mean_rate = rule.rates.x * fallen;
-    let cost_gradient = vec4f(rule.cost.y * p.scale, rule.cost.x * opacity * (1.0 - opacity));
+    let done = min(step / max(rule.decay.w, 1.0), 1.0);
+    let mean_rate = rule.rates.x * pow(rule.sh_rates.w, done);
+    // The costs double as the model gets able to fit what a single image shows.
+    let cost_gradient = (1.0 + done) * vec4f(rule.cost.y * p.scale, rule.cost.x * opacity * (1.0 - opacity));
     let mean_step = adam4(0u, splat_ix, vec4f(v_mean, 0.0));
     let rotation_step = adam4(2u, splat_ix, v_rotation);
     let shape_step = adam4(4u, splat_ix, vec4f(v_log_scale, v_opacity_logit) + cost_gradient);
