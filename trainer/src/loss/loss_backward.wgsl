@@ -1,23 +1,25 @@
 // loss_backward: the slope of the loss towards every pixel's color, transmittance and depth.
 //
 // threads   one per pixel, a workgroup per 16 x 16 pixels
-// reads     view, supervision, image, depth [n_pixels] (premultiplied), target_image, target_depth [n_pixels] (metres, 0: none), slopes
+// reads     view, supervision, status, image, depth [n_pixels] (premultiplied), target_image, target_depth [n_pixels] (metres, 0: none), slopes
 // writes    upstream [n_pixels] (v of rgb; w: v of depth), rest [n_pixels] (see backward.wgsl; y: absolute error), errors [n_tiles]
 // twin      loss/reference.rs
 
 #import view
 #import supervision
+#import status
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> supervision: Supervision;
-@group(0) @binding(2) var<storage, read> image: array<vec4f>;
-@group(0) @binding(3) var<storage, read> depth: array<f32>;
-@group(0) @binding(4) var<storage, read> target_image: array<u32>;
-@group(0) @binding(5) var<storage, read> target_depth: array<f32>;
-@group(0) @binding(6) var<storage, read> slopes: array<f32>;
-@group(0) @binding(7) var<storage, read_write> upstream: array<vec4f>;
-@group(0) @binding(8) var<storage, read_write> rest: array<vec2f>;
-@group(0) @binding(9) var<storage, read_write> errors: array<f32>;
+@group(0) @binding(2) var<storage, read> status: array<u32>;
+@group(0) @binding(3) var<storage, read> image: array<vec4f>;
+@group(0) @binding(4) var<storage, read> depth: array<f32>;
+@group(0) @binding(5) var<storage, read> target_image: array<u32>;
+@group(0) @binding(6) var<storage, read> target_depth: array<f32>;
+@group(0) @binding(7) var<storage, read> slopes: array<f32>;
+@group(0) @binding(8) var<storage, read_write> upstream: array<vec4f>;
+@group(0) @binding(9) var<storage, read_write> rest: array<vec2f>;
+@group(0) @binding(10) var<storage, read_write> errors: array<f32>;
 
 override SSIM: bool = true;
 override DEPTH: bool = true;
@@ -38,7 +40,8 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let packed = target_image[at];
     let color = image[at];
     let seen = on_image && packed >= 0x01000000u;
-    let picture = color.rgb + color.w * supervision.background.rgb;
+    let background = background_at(supervision, status[STEP]);
+    let picture = color.rgb + color.w * background;
     let wanted = rgb_of(packed);
     let per_value = 1.0 / (3.0 * f32(n_pixels));
     var v_color = (1.0 - supervision.background.w) * per_value * sign(picture - wanted);
@@ -70,7 +73,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     }
     var error = 0.0;
     if seen { error = dot(abs(picture - wanted), vec3f(1.0 / 3.0)); } else { v_color = vec3f(0.0); }
-    var v_transmittance = dot(v_color, supervision.background.rgb);
+    var v_transmittance = dot(v_color, background);
     var v_depth = 0.0;
     let depth_sum = depth[at];
     if DEPTH && on_image {

@@ -1,19 +1,21 @@
 // ssim: the structural similarity of picture and keyframe, and its slopes towards the window's statistics.
 //
 // threads   one per pixel, a workgroup per 16 x 16 pixels
-// reads     view, supervision, image [n_pixels] (premultiplied rgb, transmittance), target [n_pixels] (rgba8; a = 0: masked)
+// reads     view, supervision, status, image [n_pixels] (premultiplied rgb, transmittance), target [n_pixels] (rgba8; a = 0: masked)
 // writes    slopes [3 channels, 3, n_pixels]: of E[x], E[x x], E[x y]
 // twin      loss/reference.rs
 // source    Wang et al. 2004; gaussian 11, sigma 1.5, zeros outside; one pass over shared memory as in Mallick et al. 2024
 
 #import view
 #import supervision
+#import status
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> supervision: Supervision;
-@group(0) @binding(2) var<storage, read> image: array<vec4f>;
-@group(0) @binding(3) var<storage, read> target_image: array<u32>;
-@group(0) @binding(4) var<storage, read_write> slopes: array<f32>;
+@group(0) @binding(2) var<storage, read> status: array<u32>;
+@group(0) @binding(3) var<storage, read> image: array<vec4f>;
+@group(0) @binding(4) var<storage, read> target_image: array<u32>;
+@group(0) @binding(5) var<storage, read_write> slopes: array<f32>;
 
 var<workgroup> wg_pair: array<vec2f, 676>;        // picture, keyframe
 var<workgroup> wg_means: array<vec4f, 416>;       // along rows: x, y, x x, y y
@@ -26,6 +28,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let size = vec2i(view.size_px);
     let n_pixels = view.size_px.x * view.size_px.y;
     let gaussian = GAUSSIAN;
+    let background = background_at(supervision, status[STEP]);
     for (var channel = 0u; channel < 3u; channel++) {
         for (var i = lane; i < SPAN * SPAN; i += 256u) {
             let pixel = corner + vec2i(vec2u(i % SPAN, i / SPAN)) - i32(HALO);
@@ -35,7 +38,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
                 let packed = target_image[at];
                 let color = image[at];
                 if packed >= 0x01000000u {
-                    pair = vec2f(color[channel] + color.w * supervision.background[channel], rgb_of(packed)[channel]);
+                    pair = vec2f(color[channel] + color.w * background[channel], rgb_of(packed)[channel]);
                 }
             }
             wg_pair[i] = pair;

@@ -1,8 +1,11 @@
 // supervision: what the picture is compared with and how.
 
+#import random
+
 struct Supervision {
     background: vec4f,     // rgb behind everything; w: share of D-SSIM in the color loss
-    depth: vec4f,          // weight per metre, metres past which a reading is ignored; z, w: unused
+    depth: vec4f,          // weight per metre, metres past which a reading is ignored; z: 1 for another background every
+                           // step, so that leaving a place bare never pays; w: unused
 }
 
 const WINDOW = 11u;
@@ -17,4 +20,8 @@ const GAUSSIAN = array<f32, 11>(
 
 fn rgb_of(packed: u32) -> vec3f {
     return unpack4x8unorm(packed).rgb;
+}
+
+fn background_at(supervision: Supervision, step: u32) -> vec3f {
+    return supervision.background.rgb + supervision.depth.z * uniform3(vec3u(step, 1u, 2u));
 }

@@ -216,7 +216,8 @@ fn check_gradients(
         dssim_frac: f32_of(weights.dssim_frac),
         depth_weight: f32_of(weights.depth_per_m),
         depth_clip_m: f32_of(weights.depth_clip_m),
-        unused: [0.0; 2],
+        varied_background: 0.0,
+        unused: 0.0,
     };
     let supervision = gpu.uniform_with("supervision", &supervision);
     let rule = gpu.uniform_with("rule", &<Rule as bytemuck::Zeroable>::zeroed());

@@ -4,7 +4,7 @@ use super::arrays::SplatArrays;
 use super::cloud::synthetic_cloud;
 use super::{SplatOptions, SplatTrainer};
 use crate::eval::{PixelPair, psnr};
-use crate::gpu::{Gpu, GpuOptions};
+use crate::gpu::{Gpu, GpuOptions, f32s_of};
 use crate::{DepthMap, Keyframe, Method, Projection, RenderRequest, Split};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, Vector3};
@@ -13,11 +13,22 @@ use std::sync::Arc;
 const SIZE_PX: [u32; 2] = [96, 80];
 const FOCAL_PX: f64 = 90.0;
 
-/// A cloud of opaque splats: something with surfaces, that depth images make sense of.
+/// The inside of a colorful sphere: a closed surface, that depth images make sense of.
 fn scene() -> SplatArrays {
-    let mut arrays = synthetic_cloud(150, 3);
+    const N_DISCS: usize = 400;
+    let mut arrays = synthetic_cloud(N_DISCS, 3);
+    for ix in 0..N_DISCS {
+        // Evenly spread (Vogel 1979), facing the middle.
+        let height = 1.0 - (2 * ix + 1) as f64 / N_DISCS as f64;
+        let (turn, radius) = (ix as f64 * 2.399_963, (1.0 - height * height).sqrt());
+        let out = Vector3::new(radius * turn.cos(), height, radius * turn.sin());
+        let facing =
+            nalgebra::UnitQuaternion::rotation_between(&Vector3::z(), &out).expect("no disc lies opposite to z");
+        arrays.means[ix] = f32s_of((6.0 * out).into());
+        arrays.rotations_wxyz[ix] = f32s_of([facing.w, facing.i, facing.j, facing.k]);
+    }
+    arrays.log_scales.fill([-0.6, -0.6, -4.0]);
     arrays.opacity_logits.fill(4.0);
-    arrays.log_scales.fill([-1.9; 3]);
     arrays.sh.chunks_exact_mut(16).for_each(|coeffs| coeffs[1..].fill([0.0; 3])); // The same from every side.
     arrays
 }
@@ -79,7 +90,7 @@ fn keyframes(gpu: &Arc<Gpu>, with_depth: bool) -> Vec<Arc<Keyframe>> {
 
 fn options() -> SplatOptions {
     SplatOptions {
-        max_splats: 1500,
+        max_splats: 4000,
         n_planned_steps: 300,
         coarse_steps: Some([20, 60]),
         sh_degree: 1,
@@ -139,6 +150,25 @@ fn learns_without_depth_from_a_random_start() {
     train(&mut trainer, 120);
     let after = test_psnr(&mut trainer, &keyframes);
     assert!(after > before + 2.0, "{before} -> {after} dB");
+}
+
+/// Black splats look like no splats before a black background, but they hide what is behind them and have a depth.
+#[test]
+fn black_things_stay_solid() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let mut trainer = SplatTrainer::new(gpu.clone(), options()).unwrap();
+    let keyframes = keyframes(&gpu, true);
+    for keyframe in &keyframes {
+        let rgba = keyframe.rgba_srgb.chunks_exact(4).flat_map(|pixel| [0, 0, 0, pixel[3]]).collect();
+        trainer.push(Arc::new(Keyframe { rgba_srgb: rgba, ..keyframe.as_ref().clone() })).unwrap();
+    }
+    train(&mut trainer, 250);
+    let picture = trainer.render(&request(keyframes[0].world_from_camera)).unwrap();
+    let wanted = &keyframes[0].depth.as_ref().unwrap().depth_m;
+    let solid = wanted.iter().zip(picture.rgba_srgb.chunks_exact(4)).filter(|(wanted_m, _)| **wanted_m > 0.0);
+    let coverage: Vec<f64> = solid.map(|(_, pixel)| f64::from(pixel[3]) / 255.0).collect();
+    let mean = coverage.iter().sum::<f64>() / coverage.len() as f64;
+    assert!(mean > 0.9, "{mean} of what depth shows is covered");
 }
 
 #[test]

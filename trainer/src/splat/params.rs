@@ -137,7 +137,8 @@ pub(crate) struct Supervision {
     pub(crate) dssim_frac: f32,
     pub(crate) depth_weight: f32,
     pub(crate) depth_clip_m: f32,
-    pub(crate) unused: [f32; 2],
+    pub(crate) varied_background: f32,
+    pub(crate) unused: f32,
 }
 
 /// Indices into the status array, as in shared/status.wgsl.

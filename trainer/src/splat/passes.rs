@@ -230,11 +230,12 @@ impl ViewPasses<'_> {
 
     /// Compares the picture with its target: the slopes towards every pixel.
     pub(crate) fn compare(&self, passes: &mut Passes, pipelines: &LearnPipelines, target: &Target<'_>) {
-        let Self { gpu, frame, view, .. } = *self;
+        let Self { gpu, frame, status, view, .. } = *self;
         let n_groups = u64::from(n_tiles(self.size_px));
         let base = [
             ("view", view),
             ("supervision", target.supervision),
+            ("status", status),
             ("image", &frame.image),
             ("target_image", target.image),
         ];

@@ -33,6 +33,8 @@ const MAX_STEPS_PER_SUBMIT: u64 = 64;
 /// Readings further than this from the rendered depth are outliers.
 const DEPTH_CLIP_M: f64 = 0.2;
 
+/// Share of the most splats there may be that one image may take for its seeds: the others need some, too.
+const SEED_SHARE: f64 = 1.0 / 8.0;
 /// Place of a child within its parent, in standard deviations.
 const CHILD_SPREAD: f32 = 0.5;
 /// Opacity and size cost as much against the color loss as if this many images had seen a scene without them: the fewer
@@ -112,14 +114,18 @@ impl SplatTrainer {
                     dssim_frac: f32_of(options.dssim_frac),
                     depth_weight: f32_of(options.depth_per_m),
                     depth_clip_m: f32_of(DEPTH_CLIP_M),
-                    unused: [0.0; 2],
+                    varied_background: 1.0,
+                    unused: 0.0,
                 },
             ),
             plain: gpu.uniform_with("splat.background", &<Supervision as bytemuck::Zeroable>::zeroed()),
             passes: Passes::default(),
             seeder: Seeder::default(),
             unseeded: Vec::new(),
-            seeds_per_image: options.seeds_per_image.unwrap_or(if software { 4_000.0 } else { 20_000.0 }),
+            seeds_per_image: options
+                .seeds_per_image
+                .unwrap_or(if software { 4_000.0 } else { 20_000.0 })
+                .min(f64::from(options.cap()) * SEED_SHARE),
             coarse_steps: options.coarse_steps.unwrap_or(if software { [500, 4000] } else { [150, 400] }),
             views: Vec::new(),
             scene_size_m: 1.0,
