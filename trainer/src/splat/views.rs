@@ -4,7 +4,7 @@
     reason = "pixels are rounded down on purpose, within image sizes that are u32"
 )]
 
-use super::params::{Camera, LOW_PASS_PX2};
+use super::params::{Camera, LOW_PASS_PX2, TILE_PX};
 use crate::gpu::{Buffer, Gpu, f32_of};
 use crate::{Error, Keyframe, Shutter};
 use nalgebra::Point3;
@@ -37,8 +37,10 @@ impl TrainView {
         Self { keyframe, levels: [const { None }; 3] }
     }
 
-    /// The keyframe `2^level` times smaller, uploaded at first use.
+    /// The keyframe `2^level` times smaller, but no side below a tile's, uploaded at first use.
     pub(crate) fn level(&mut self, gpu: &Gpu, level: u32) -> Result<&Level, Error> {
+        let [width, height] = self.keyframe.size_px;
+        let level = level.min((width.min(height) / TILE_PX).max(1).ilog2());
         let slot = &mut self.levels[level as usize];
         let made = match slot.take() {
             Some(made) => made,

@@ -109,7 +109,7 @@ action("look-live", "c", () => {
 });
 element("look-live", HTMLButtonElement).disabled = true;
 toggle("toggle-grid", "g", (isOn) => (view.overlays.showsGround = isOn));
-toggle("toggle-frustums", "k", (isOn) => (view.overlays.showsFrustums = isOn));
+toggle("toggle-keyframes", "k", (isOn) => (view.overlays.showsKeyframes = isOn));
 toggle("toggle-occlude", "o", (isOn) => (view.picture.occludes = isOn));
 
 function frame(): void {

@@ -10,22 +10,24 @@ const LIVE_COLOR = 0x4cc2a6;
 export class Overlays {
   readonly root = new THREE.Group();
   private readonly ground = new THREE.Group();
-  private readonly frustums = new THREE.Group();
+  private readonly cameras = new THREE.Group();
   private readonly keyframes = lines(KEYFRAME_COLOR, 0.35);
   private readonly live = new Map<string, THREE.LineSegments>();
   private frustumDepth = 0.06;
 
   constructor() {
-    this.frustums.add(this.keyframes);
-    this.root.add(this.ground, this.frustums);
+    this.keyframes.visible = false; // Hundreds of them hide the scene.
+    this.root.add(this.ground, this.cameras, this.keyframes);
   }
 
+  /** Grid, axes and live cameras. */
   set showsGround(visible: boolean) {
     this.ground.visible = visible;
+    this.cameras.visible = visible;
   }
 
-  set showsFrustums(visible: boolean) {
-    this.frustums.visible = visible;
+  set showsKeyframes(visible: boolean) {
+    this.keyframes.visible = visible;
   }
 
   /** Lays grid and axes for a scene of this size. */
@@ -53,7 +55,7 @@ export class Overlays {
     if (!drawn) {
       drawn = lines(LIVE_COLOR, 1);
       this.live.set(camera.camera, drawn);
-      this.frustums.add(drawn);
+      this.cameras.add(drawn);
     }
     setLines(drawn, frustum(camera, 1.6 * this.frustumDepth));
   }
