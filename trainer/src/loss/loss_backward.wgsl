@@ -44,7 +44,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let picture = color.rgb + color.w * background;
     let wanted = rgb_of(packed);
     let per_value = 1.0 / (3.0 * f32(n_pixels));
-    var v_color = (1.0 - supervision.background.w) * per_value * sign(picture - wanted);
+    var v_color = (1.0 - supervision.dssim_frac) * per_value * sign(picture - wanted);
     if SSIM {
         let gaussian = GAUSSIAN;
         for (var channel = 0u; channel < 3u; channel++) {
@@ -68,7 +68,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
             workgroupBarrier(); // The rows are there; the next channel writes them only after its own first barrier.
             var sum = vec4f(0.0);
             for (var k = 0u; k < WINDOW; k++) { sum += gaussian[k] * wg_rows[lane + k * TILE_PX]; }
-            v_color[channel] -= supervision.background.w * per_value * (sum.x + 2.0 * picture[channel] * sum.y + wanted[channel] * sum.z);
+            v_color[channel] -= supervision.dssim_frac * per_value * (sum.x + 2.0 * picture[channel] * sum.y + wanted[channel] * sum.z);
         }
     }
     var error = 0.0;
@@ -79,8 +79,8 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     if DEPTH && on_image {
         let wanted_m = target_depth[at];
         let miss_m = depth_sum - (1.0 - color.w) * wanted_m;
-        if wanted_m > 0.0 && abs(miss_m) < supervision.depth.y {
-            v_depth = supervision.depth.x / f32(n_pixels) * sign(miss_m);
+        if wanted_m > 0.0 && abs(miss_m) < supervision.depth_clip_m {
+            v_depth = supervision.depth_weight / f32(n_pixels) * sign(miss_m);
             v_transmittance += v_depth * wanted_m;
         }
     }

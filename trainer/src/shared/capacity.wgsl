@@ -3,4 +3,5 @@
 struct Capacity {
     n_isect: u32,
     n_buckets: u32,
+    unused: vec2u,
 }

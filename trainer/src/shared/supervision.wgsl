@@ -3,9 +3,11 @@
 #import random
 
 struct Supervision {
-    background: vec4f,     // rgb behind everything; w: share of D-SSIM in the color loss
-    depth: vec4f,          // weight per metre, metres past which a reading is ignored; z: 1 for another background every
-                           // step, so that leaving a place bare never pays; w: unused
+    background_srgb: vec4f,   // behind everything; w unused
+    dssim_frac: f32,          // share of D-SSIM in the color loss
+    depth_weight: f32,        // per metre
+    depth_clip_m: f32,        // past which a reading is ignored
+    varied_background: f32,   // 1: another background every step, so that leaving a place bare never pays
 }
 
 const WINDOW = 11u;
@@ -23,5 +25,5 @@ fn rgb_of(packed: u32) -> vec3f {
 }
 
 fn background_at(supervision: Supervision, step: u32) -> vec3f {
-    return supervision.background.rgb + supervision.depth.z * uniform3(vec3u(step, 1u, 2u));
+    return supervision.background_srgb.rgb + supervision.varied_background * uniform3(vec3u(step, 1u, 2u));
 }

@@ -212,12 +212,11 @@ fn check_gradients(
     let image = gpu.storage_with("target", bytemuck::cast_slice(&packed)).unwrap();
     let depth = gpu.storage_with("target depth", bytemuck::cast_slice(&depth)).unwrap();
     let supervision = Supervision {
-        background_srgb: weights.background_rgb.map(f32_of),
+        background_srgb: [0, 1, 2, 0].map(|channel| f32_of(weights.background_rgb[channel])),
         dssim_frac: f32_of(weights.dssim_frac),
         depth_weight: f32_of(weights.depth_per_m),
         depth_clip_m: f32_of(weights.depth_clip_m),
         varied_background: 0.0,
-        unused: 0.0,
     };
     let supervision = gpu.uniform_with("supervision", &supervision);
     let rule = gpu.uniform_with("rule", &<Rule as bytemuck::Zeroable>::zeroed());

@@ -20,7 +20,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let at = folded(wg, n_wgs) * WG_SIZE + lane;
     if at >= view.size_px.x * view.size_px.y { return; } // Allowed here: no barrier below.
     let color = image[at];
-    let rgb = clamp(color.rgb + color.w * supervision.background.rgb, vec3f(0.0), vec3f(1.0));
+    let rgb = clamp(color.rgb + color.w * supervision.background_srgb.rgb, vec3f(0.0), vec3f(1.0));
     let bytes = vec4u(floor(vec4f(rgb, 1.0 - color.w) * 255.0 + 0.5));
     pixels[at] = bytes.x | (bytes.y << 8u) | (bytes.z << 16u) | (bytes.w << 24u);
     let coverage = 1.0 - color.w;

@@ -190,31 +190,75 @@ impl LearnPipelines {
 mod tests {
     use crate::gpu::{reflect, resolve};
 
-    /// Size in bytes of a struct as WGSL lays it out, in the first kernel that knows it.
-    fn span_in_wgsl(name: &str) -> usize {
-        let spans = super::KERNELS.iter().filter_map(|kernel| {
+    /// Names and offsets of a struct's fields and its size, as WGSL lays it out in every kernel that knows it.
+    fn layout_in_wgsl(name: &str) -> (Vec<(String, usize)>, usize) {
+        let layouts = super::KERNELS.iter().filter_map(|kernel| {
             let module = reflect(kernel.source.name, &resolve(kernel.source, kernel.shared).unwrap()).unwrap();
-            module.types.iter().find_map(|(_, found)| match found.inner {
-                wgpu::naga::TypeInner::Struct { span, .. } if found.name.as_deref() == Some(name) => {
-                    Some(span as usize)
+            module.types.iter().find_map(|(_, found)| match &found.inner {
+                wgpu::naga::TypeInner::Struct { members, span } if found.name.as_deref() == Some(name) => {
+                    let fields = members.iter().map(|member| (member.name.clone().unwrap(), member.offset as usize));
+                    Some((fields.collect(), *span as usize))
                 }
                 _ => None,
             })
         });
-        let spans: Vec<usize> = spans.collect();
-        assert!(spans.iter().all(|span| *span == spans[0]), "{name} differs between kernels: {spans:?}");
-        spans[0]
+        let layouts: Vec<(Vec<_>, usize)> = layouts.collect();
+        assert!(layouts.iter().all(|layout| *layout == layouts[0]), "{name} differs between kernels: {layouts:?}");
+        layouts[0].clone()
+    }
+
+    macro_rules! assert_layout {
+        ($type:ident, [$($field:ident),*]) => {
+            let in_rust = vec![$((stringify!($field).to_owned(), std::mem::offset_of!($type, $field))),*];
+            assert_eq!((in_rust, size_of::<$type>()), layout_in_wgsl(stringify!($type)), stringify!($type));
+        };
     }
 
     #[test]
-    fn structs_are_as_long_in_rust_as_in_wgsl() {
+    fn structs_have_the_same_fields_in_rust_and_wgsl() {
         use crate::splat::params::{Capacity, Growth, Model, Rule, Supervision, View};
-        assert_eq!(size_of::<View>(), span_in_wgsl("View"));
-        assert_eq!(size_of::<Model>(), span_in_wgsl("Model"));
-        assert_eq!(size_of::<Rule>(), span_in_wgsl("Rule"));
-        assert_eq!(size_of::<Supervision>(), span_in_wgsl("Supervision"));
-        assert_eq!(size_of::<Growth>(), span_in_wgsl("Growth"));
-        assert_eq!(size_of::<Capacity>(), span_in_wgsl("Capacity") + 8, "uniform buffers are filled up to 16 bytes");
+        assert_layout!(
+            View,
+            [
+                camera_rows,
+                center_in_world,
+                focal_px,
+                principal_px,
+                size_px,
+                n_tiles,
+                shutter_linear,
+                shutter_angular,
+                crop_rows,
+                crop_min,
+                crop_max
+            ]
+        );
+        assert_layout!(Model, [n_splats, capacity, sh_degree, n_sh_rest]);
+        assert_layout!(
+            Rule,
+            [
+                mean_rate_m,
+                log_scale_rate,
+                rotation_rate,
+                opacity_rate,
+                sh_dc_rate,
+                sh_rest_rate,
+                noise,
+                final_mean_rate_frac,
+                betas,
+                epsilon,
+                n_planned_steps,
+                opacity_cost,
+                scale_cost,
+                log_scale_range,
+                seed,
+                update_all,
+                unused
+            ]
+        );
+        assert_layout!(Supervision, [background_srgb, dssim_frac, depth_weight, depth_clip_m, varied_background]);
+        assert_layout!(Growth, [n_before, n_after, key, capacity, n_sh_rest, child_spread, least_opacity, unused]);
+        assert_layout!(Capacity, [n_isect, n_buckets, unused]);
     }
 
     #[test]

@@ -133,12 +133,11 @@ pub(crate) struct Rule {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct Supervision {
-    pub(crate) background_srgb: [f32; 3],
+    pub(crate) background_srgb: [f32; 4],
     pub(crate) dssim_frac: f32,
     pub(crate) depth_weight: f32,
     pub(crate) depth_clip_m: f32,
     pub(crate) varied_background: f32,
-    pub(crate) unused: f32,
 }
 
 /// Indices into the status array, as in shared/status.wgsl.

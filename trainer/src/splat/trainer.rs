@@ -110,12 +110,11 @@ impl SplatTrainer {
             supervision: gpu.uniform_with(
                 "splat.supervision",
                 &Supervision {
-                    background_srgb: [0.0; 3],
+                    background_srgb: [0.0; 4],
                     dssim_frac: f32_of(options.dssim_frac),
                     depth_weight: f32_of(options.depth_per_m),
                     depth_clip_m: f32_of(DEPTH_CLIP_M),
                     varied_background: 1.0,
-                    unused: 0.0,
                 },
             ),
             plain: gpu.uniform_with("splat.background", &<Supervision as bytemuck::Zeroable>::zeroed()),
@@ -441,7 +440,8 @@ impl SplatTrainer {
     fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3]) -> Result<Picture, Error> {
         let size_px = camera.size_px;
         let view = self.gpu.uniform_with("splat.draw_view", &camera.view());
-        let background = Supervision { background_srgb, ..bytemuck::Zeroable::zeroed() };
+        let [red, green, blue] = background_srgb;
+        let background = Supervision { background_srgb: [red, green, blue, 0.0], ..bytemuck::Zeroable::zeroed() };
         self.gpu.write(&self.plain, 0, bytemuck::bytes_of(&background));
         loop {
             let need = self.scratch_need(size_px, false);

@@ -16,14 +16,23 @@
 #import random
 
 struct Rule {
-    rates: vec4f,          // of mean (metres), log_scale, rotation, opacity_logit
-    sh_rates: vec4f,       // of the constant color, of the other functions; z: noise; w: final share of the mean's rate
-    decay: vec4f,          // Adam's beta 1, beta 2, epsilon; w: steps over which the mean's rate falls
-    cost: vec4f,           // of opacity, of scale (per splat); smallest and largest log_scale
+    mean_rate_m: f32,             // at the start
+    log_scale_rate: f32,
+    rotation_rate: f32,
+    opacity_rate: f32,
+    sh_dc_rate: f32,
+    sh_rest_rate: f32,
+    noise: f32,                   // on the means of splats that hardly show, against their rate
+    final_mean_rate_frac: f32,    // what is left of the means' rate at the end
+    betas: vec2f,                 // of Adam
+    epsilon: f32,                 // of Adam
+    n_planned_steps: f32,
+    opacity_cost: f32,            // per splat
+    scale_cost: f32,              // per splat and metre
+    log_scale_range: vec2f,
     seed: u32,
-    update_all: u32,       // 1: also splats that this view does not show
-    unused_0: u32,
-    unused_1: u32,
+    update_all: u32,              // 1: also splats that this view does not show
+    unused: vec2u,
 }
 
 @group(0) @binding(0) var<uniform> view: View;
@@ -49,16 +58,16 @@ var<private> correction: vec2f;   // 1 / (1 - beta^t)
 
 fn adam4(plane: u32, splat_ix: u32, gradient: vec4f) -> vec4f {
     let at = plane * model.capacity + splat_ix;
-    let first = mix(gradient, moments[at], rule.decay.x);
-    let second = mix(gradient * gradient, moments[at + model.capacity], rule.decay.y);
+    let first = mix(gradient, moments[at], rule.betas.x);
+    let second = mix(gradient * gradient, moments[at + model.capacity], rule.betas.y);
     moments[at] = first;
     moments[at + model.capacity] = second;
-    return first * correction.x / (sqrt(second * correction.y) + rule.decay.z);
+    return first * correction.x / (sqrt(second * correction.y) + rule.epsilon);
 }
 
 fn adam1(moment: ptr<function, vec2f>, gradient: f32) -> f32 {
-    *moment = mix(vec2f(gradient, gradient * gradient), *moment, rule.decay.xy);
-    return (*moment).x * correction.x / (sqrt((*moment).y * correction.y) + rule.decay.z);
+    *moment = mix(vec2f(gradient, gradient * gradient), *moment, rule.betas);
+    return (*moment).x * correction.x / (sqrt((*moment).y * correction.y) + rule.epsilon);
 }
 
 fn finite(x: vec4f) -> bool {
@@ -135,7 +144,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
             + v_jacobian_x.z * f.x * ratio.x * (1.0 + p.unclamped.x) / (z * z)
             + v_jacobian_y.z * f.y * ratio.y * (1.0 + p.unclamped.y) / (z * z);
         let v_still = v_point + p.tau * cross(view.shutter_angular.xyz, v_point);
-        v_mean = view.camera_row_0.xyz * v_still.x + view.camera_row_1.xyz * v_still.y + view.camera_row_2.xyz * v_still.z;
+        v_mean = view.camera_rows[0].xyz * v_still.x + view.camera_rows[1].xyz * v_still.y + view.camera_rows[2].xyz * v_still.z;
     }
 
     // Color: recomputed for its clamp at 0, and for the gradient through the direction.
@@ -173,11 +182,11 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     }
 
     let step = f32(atomicLoad(&status[STEP]));
-    correction = 1.0 / (1.0 - pow(rule.decay.xy, vec2f(step + 1.0)));
-    let done = min(step / max(rule.decay.w, 1.0), 1.0);
-    let mean_rate = rule.rates.x * pow(rule.sh_rates.w, done);
+    correction = 1.0 / (1.0 - pow(rule.betas, vec2f(step + 1.0)));
+    let done = min(step / max(rule.n_planned_steps, 1.0), 1.0);
+    let mean_rate = rule.mean_rate_m * pow(rule.final_mean_rate_frac, done);
     // The costs double as the model gets able to fit what a single image shows.
-    let cost_gradient = (1.0 + done) * vec4f(rule.cost.y * p.scale, rule.cost.x * opacity * (1.0 - opacity));
+    let cost_gradient = (1.0 + done) * vec4f(rule.scale_cost * p.scale, rule.opacity_cost * opacity * (1.0 - opacity));
     let mean_step = adam4(0u, splat_ix, vec4f(v_mean, 0.0));
     let rotation_step = adam4(2u, splat_ix, v_rotation);
     let shape_step = adam4(4u, splat_ix, vec4f(v_log_scale, v_opacity_logit) + cost_gradient);
@@ -186,23 +195,23 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let loose = 1.0 / (1.0 + exp(100.0 * (opacity - 0.005)));
     let normal = normal3(vec3u(splat_ix, atomicLoad(&status[STEP]), rule.seed));
     let stretched = p.rotation * (p.scale * p.scale * (transpose(p.rotation) * normal));
-    let jitter = rule.sh_rates.z * mean_rate * loose * stretched;
+    let jitter = rule.noise * mean_rate * loose * stretched;
 
     means[splat_ix] = vec4f(mean - mean_rate * mean_step.xyz + jitter, 0.0);
-    let turned = rotation - rule.rates.z * rotation_step;
+    let turned = rotation - rule.rotation_rate * rotation_step;
     rotations[splat_ix] = turned / max(length(turned), 1e-12);
-    let shaped = shape - vec4f(vec3f(rule.rates.y), rule.rates.w) * shape_step;
-    shapes[splat_ix] = vec4f(clamp(shaped.xyz, vec3f(rule.cost.z), vec3f(rule.cost.w)), clamp(shaped.w, -12.0, 12.0));
+    let shaped = shape - vec4f(vec3f(rule.log_scale_rate), rule.opacity_rate) * shape_step;
+    shapes[splat_ix] = vec4f(clamp(shaped.xyz, vec3f(rule.log_scale_range.x), vec3f(rule.log_scale_range.y)), clamp(shaped.w, -12.0, 12.0));
     for (var channel = 0u; channel < 3u; channel++) {
         let at = channel * capacity + splat_ix;
         var moment = sh_dc_moments[at];
-        sh_dc[at] -= rule.sh_rates.x * adam1(&moment, SH_0 * v_color[channel]);
+        sh_dc[at] -= rule.sh_dc_rate * adam1(&moment, SH_0 * v_color[channel]);
         sh_dc_moments[at] = moment;
     }
     for (var plane = 0u; plane < model.n_sh_rest; plane++) {
         let at = plane * capacity + splat_ix;
         var moment = sh_rest_moments[at];
-        sh_rest[at] -= rule.sh_rates.y * adam1(&moment, basis[plane / 3u] * v_color[plane % 3u]);
+        sh_rest[at] -= rule.sh_rest_rate * adam1(&moment, basis[plane / 3u] * v_color[plane % 3u]);
         sh_rest_moments[at] = moment;
     }
     error_sums[splat_ix] += sum.conic.w;
