@@ -22,19 +22,19 @@ const GRADIENT_REL: f64 = 2e-3;
 /// Where a decision is this close to its threshold, f32 may decide otherwise.
 const MARGIN: f64 = 1e-4;
 
-struct Bench {
-    gpu: Arc<Gpu>,
-    draw: DrawPipelines,
-    learn: LearnPipelines,
-    splats: SplatBuffers,
-    scratch: Scratch,
-    frame: Frame,
-    status: Buffer,
-    view: Buffer,
-    size_px: [u32; 2],
+pub(super) struct Bench {
+    pub(super) gpu: Arc<Gpu>,
+    pub(super) draw: DrawPipelines,
+    pub(super) learn: LearnPipelines,
+    pub(super) splats: SplatBuffers,
+    pub(super) scratch: Scratch,
+    pub(super) frame: Frame,
+    pub(super) status: Buffer,
+    pub(super) view: Buffer,
+    pub(super) size_px: [u32; 2],
 }
 
-fn arrays_of(splats: &[Splat]) -> SplatArrays {
+pub(super) fn arrays_of(splats: &[Splat]) -> SplatArrays {
     let f = |values: [f64; 3]| values.map(f32_of);
     SplatArrays {
         means: splats.iter().map(|splat| f(splat.mean)).collect(),
@@ -65,7 +65,7 @@ fn camera_of(view: &View) -> Camera {
 }
 
 impl Bench {
-    fn new(options: &GpuOptions, view: &View, arrays: &SplatArrays) -> Self {
+    pub(super) fn new(options: &GpuOptions, view: &View, arrays: &SplatArrays) -> Self {
         let gpu = Gpu::open(options).unwrap();
         let draw = DrawPipelines::new(&gpu).unwrap();
         let learn = LearnPipelines::new(&gpu).unwrap();
@@ -84,7 +84,7 @@ impl Bench {
         Self { draw, learn, splats, scratch, frame, status, view: view_buffer, size_px: view.size_px, gpu }
     }
 
-    fn passes(&self) -> ViewPasses<'_> {
+    pub(super) fn passes(&self) -> ViewPasses<'_> {
         ViewPasses {
             gpu: &self.gpu,
             splats: &self.splats,
@@ -96,7 +96,7 @@ impl Bench {
         }
     }
 
-    fn render(&self) -> (Vec<[f32; 4]>, Vec<f32>) {
+    pub(super) fn render(&self) -> (Vec<[f32; 4]>, Vec<f32>) {
         let mut passes = Passes::default();
         self.passes().draw(&mut passes, &self.draw, &self.learn.rasterize);
         passes.submit(&self.gpu);
@@ -110,7 +110,7 @@ fn forms() -> [GpuOptions; 2] {
     [GpuOptions::default(), GpuOptions { optional_features: false, ..GpuOptions::default() }]
 }
 
-fn clear_pixels(view: &View, splats: &[Splat]) -> Vec<bool> {
+pub(super) fn clear_pixels(view: &View, splats: &[Splat]) -> Vec<bool> {
     let clear: Vec<bool> =
         reference::rasterize::threshold_margins(view, splats).iter().map(|margin| *margin > MARGIN).collect();
     assert!(
@@ -152,7 +152,7 @@ fn pictures_match_the_twin() {
     }
 }
 
-fn target_of(image: &RenderedImage, size_px: [u32; 2]) -> loss_reference::Target {
+pub(super) fn target_of(image: &RenderedImage, size_px: [u32; 2]) -> loss_reference::Target {
     let n = image.rgb.len();
     // Far from the picture everywhere, so that no absolute difference changes sign by rounding.
     let byte = |value: f64| ((value + 0.25).rem_euclid(1.0) * 255.0).round() / 255.0;
@@ -190,6 +190,42 @@ fn gradients_match_the_twin() {
     }
 }
 
+/// What a picture is compared with, on the GPU.
+pub(super) struct Wanted {
+    image: Buffer,
+    depth: Buffer,
+    supervision: Buffer,
+}
+
+impl Wanted {
+    pub(super) fn new(gpu: &Gpu, target: &loss_reference::Target, weights: &loss_reference::Weights) -> Self {
+        let byte = |value: f64| u32::from(format!("{:.0}", value * 255.0).parse::<u8>().unwrap());
+        let packed: Vec<u32> = target
+            .rgb
+            .iter()
+            .zip(&target.seen)
+            .map(|(rgb, seen)| {
+                byte(rgb[0]) | byte(rgb[1]) << 8 | byte(rgb[2]) << 16 | if *seen { 0xff00_0000 } else { 0 }
+            })
+            .collect();
+        let depth: Vec<f32> = target.depth_m.iter().map(|depth_m| f32_of(*depth_m)).collect();
+        let image = gpu.storage_with("target", bytemuck::cast_slice(&packed)).unwrap();
+        let depth = gpu.storage_with("target depth", bytemuck::cast_slice(&depth)).unwrap();
+        let supervision = Supervision {
+            background_srgb: [0, 1, 2, 0].map(|channel| f32_of(weights.background_rgb[channel])),
+            dssim_frac: f32_of(weights.dssim_frac),
+            depth_weight: f32_of(weights.depth_per_m),
+            depth_clip_m: f32_of(weights.depth_clip_m),
+            varied_background: 0.0,
+        };
+        Self { image, depth, supervision: gpu.uniform_with("supervision", &supervision) }
+    }
+
+    pub(super) fn target(&self) -> Target<'_> {
+        Target { image: &self.image, depth: &self.depth, supervision: &self.supervision, ssim: true }
+    }
+}
+
 fn check_gradients(
     options: &GpuOptions,
     view: &View,
@@ -201,34 +237,13 @@ fn check_gradients(
     let expected = reference::render_backward(view, splats, upstream);
     let bench = Bench::new(options, view, &arrays_of(splats));
     let gpu = &bench.gpu;
-    let byte = |value: f64| u32::from(format!("{:.0}", value * 255.0).parse::<u8>().unwrap());
-    let packed: Vec<u32> = target
-        .rgb
-        .iter()
-        .zip(&target.seen)
-        .map(|(rgb, seen)| byte(rgb[0]) | byte(rgb[1]) << 8 | byte(rgb[2]) << 16 | if *seen { 0xff00_0000 } else { 0 })
-        .collect();
-    let depth: Vec<f32> = target.depth_m.iter().map(|depth_m| f32_of(*depth_m)).collect();
-    let image = gpu.storage_with("target", bytemuck::cast_slice(&packed)).unwrap();
-    let depth = gpu.storage_with("target depth", bytemuck::cast_slice(&depth)).unwrap();
-    let supervision = Supervision {
-        background_srgb: [0, 1, 2, 0].map(|channel| f32_of(weights.background_rgb[channel])),
-        dssim_frac: f32_of(weights.dssim_frac),
-        depth_weight: f32_of(weights.depth_per_m),
-        depth_clip_m: f32_of(weights.depth_clip_m),
-        varied_background: 0.0,
-    };
-    let supervision = gpu.uniform_with("supervision", &supervision);
+    let wanted = Wanted::new(gpu, target, weights);
     let rule = gpu.uniform_with("rule", &<Rule as bytemuck::Zeroable>::zeroed());
     let gradients_only = LearnPipelines::gradients_only(gpu).unwrap();
     let mut passes = Passes::default();
     let view_passes = bench.passes();
     view_passes.draw(&mut passes, &bench.draw, &bench.learn.rasterize);
-    view_passes.compare(
-        &mut passes,
-        &bench.learn,
-        &Target { image: &image, depth: &depth, supervision: &supervision, ssim: true },
-    );
+    view_passes.compare(&mut passes, &bench.learn, &wanted.target());
     view_passes.backward(&mut passes, &bench.learn, &bench.draw);
     view_passes.update(&mut passes, &gradients_only, &rule);
     passes.submit(gpu);

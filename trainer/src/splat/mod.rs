@@ -5,6 +5,8 @@ mod against_twin;
 pub mod arrays;
 pub mod bench;
 mod buffers;
+#[cfg(test)]
+mod change_against_twin;
 pub mod cloud;
 mod equirect;
 pub mod kernels;

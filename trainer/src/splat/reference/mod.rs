@@ -7,7 +7,11 @@
 //! Source: Kerbl et al. 2023 (3D Gaussian splatting) and Ye et al. 2024 (gsplat, appendix on gradients). We differ in
 //! the rolling shutter, and in a depth output that is composited like a color.
 
+#[cfg(test)]
+pub(crate) mod change;
 pub mod project;
+#[cfg(test)]
+pub(crate) mod random;
 pub mod rasterize;
 pub mod sh;
 

@@ -1,0 +1,213 @@
+//! The kernels that bin, move and multiply splats, against their f64 twins.
+
+use super::against_twin::{Bench, Wanted, arrays_of, clear_pixels, target_of};
+use super::arrays::SplatArrays;
+use super::params::{Growth, Rule, status};
+use super::passes::{GrowthBuffers, grow};
+use super::reference::change::{self, SplatMoments};
+use super::reference::{self, Splat, scene};
+use crate::gpu::{GpuOptions, Passes, f32_of};
+use crate::loss::reference as loss_reference;
+use crate::mismatches::Mismatches;
+
+/// A small scene whose splats all have the same number of coefficients, and values that f32 holds.
+fn even_scene(seed: u64, n: usize) -> Vec<Splat> {
+    let mut splats = scene::small_scene(seed, n);
+    for splat in &mut splats {
+        splat.sh.resize(16, [0.0; 3]);
+    }
+    splats_of(&arrays_of(&splats))
+}
+
+fn splats_of(arrays: &SplatArrays) -> Vec<Splat> {
+    let one = |ix: usize| Splat {
+        mean: arrays.means[ix].map(f64::from),
+        log_scale: arrays.log_scales[ix].map(f64::from),
+        rotation_wxyz: arrays.rotations_wxyz[ix].map(f64::from),
+        opacity_logit: arrays.opacity_logits[ix].into(),
+        sh: arrays.sh[16 * ix..16 * (ix + 1)].iter().map(|rgb| rgb.map(f64::from)).collect(),
+    };
+    (0..arrays.n_splats()).map(one).collect()
+}
+
+/// Checks every value; `of_*` are the tolerances of means, log scales, rotations, opacities and colors.
+fn check(got: &[Splat], expected: &[Splat], tolerances: [f64; 5]) {
+    let [of_mean, of_scale, of_rotation, of_opacity, of_color] = tolerances;
+    let mut wrong = Mismatches::default();
+    for (ix, (got, expected)) in got.iter().zip(expected).enumerate() {
+        for axis in 0..3 {
+            wrong.check(format!("mean {ix} {axis}"), got.mean[axis], expected.mean[axis], of_mean, 0.0);
+            wrong.check(format!("scale {ix} {axis}"), got.log_scale[axis], expected.log_scale[axis], of_scale, 0.0);
+        }
+        for part in 0..4 {
+            let [got, expected] = [got, expected].map(|splat| splat.rotation_wxyz[part]);
+            wrong.check(format!("rotation {ix} {part}"), got, expected, of_rotation, 0.0);
+        }
+        wrong.check(format!("opacity {ix}"), got.opacity_logit, expected.opacity_logit, of_opacity, 0.0);
+        let colors = got.sh.as_flattened().iter().zip(expected.sh.as_flattened());
+        for (part, (got, expected)) in colors.enumerate() {
+            wrong.check(format!("sh {ix} {part}"), *got, *expected, of_color, 0.0);
+        }
+    }
+    wrong.assert_none();
+}
+
+/// Large enough against the gradients that none decides a step by its sign alone.
+const EPSILON: f32 = 1e-4;
+const RULE: Rule = Rule {
+    mean_rate_m: 1e-2,
+    log_scale_rate: 2e-2,
+    rotation_rate: 3e-2,
+    opacity_rate: 5e-2,
+    sh_dc_rate: 4e-2,
+    sh_rest_rate: 1e-2,
+    noise: 50.0,
+    final_mean_rate_frac: 0.1,
+    betas: [0.9, 0.99],
+    epsilon: EPSILON,
+    n_planned_steps: 5.0,
+    opacity_cost: 1e-3,
+    scale_cost: 2e-3,
+    log_scale_range: [-3.0, -1.5], // Some of the scene's splats are outside.
+    seed: 11,
+    update_all: 1,
+    unused: [0; 2],
+};
+
+#[test]
+fn optimiser_steps_match_the_twin() {
+    const N_STEPS: u32 = 3;
+    let view = scene::rolling_view();
+    let mut splats = even_scene(7, 40);
+    splats[3].opacity_logit = -5.5; // Barely seen: noise moves it.
+    splats = splats_of(&arrays_of(&splats));
+    let bench = Bench::new(&GpuOptions::default(), &view, &arrays_of(&splats));
+    let gpu = &bench.gpu;
+    let rule = gpu.uniform_with("rule", &RULE);
+    let weights = loss_reference::Weights {
+        dssim_frac: 0.25,
+        depth_per_m: 0.5,
+        depth_clip_m: 50.0,
+        background_rgb: [0.125, 0.25, 0.5],
+    };
+    let mut target = target_of(&reference::render(&view, &splats), view.size_px);
+    for (seen, clear) in target.seen.iter_mut().zip(clear_pixels(&view, &splats)) {
+        *seen &= clear;
+    }
+    target.depth_m.iter_mut().for_each(|depth_m| *depth_m = f64::from(f32_of(*depth_m)));
+    let wanted = Wanted::new(gpu, &target, &weights);
+    let mut moments: Vec<SplatMoments> = vec![vec![Default::default(); 11 + 48]; splats.len()];
+    for step in 0..N_STEPS {
+        let (_, upstream) = loss_reference::loss(&reference::render(&view, &splats), &target, &weights);
+        let gradients = reference::render_backward(&view, &splats, &upstream).splats;
+        let moved = splats.iter().zip(&gradients).zip(&mut moments).zip(0..);
+        splats = moved
+            .map(|(((splat, gradient), moments), ix)| change::update(splat, gradient, moments, &RULE, step, ix))
+            .collect();
+
+        let mut passes = Passes::default();
+        let view_passes = bench.passes();
+        view_passes.draw(&mut passes, &bench.draw, &bench.learn.rasterize);
+        view_passes.compare(&mut passes, &bench.learn, &wanted.target());
+        view_passes.backward(&mut passes, &bench.learn, &bench.draw);
+        view_passes.update(&mut passes, &bench.learn.update, &rule);
+        passes.submit(gpu);
+        gpu.write(&bench.status, 4 * status::STEP as u64, bytemuck::bytes_of(&(step + 1)));
+    }
+    // A step is at most about a rate long; gradients agree to a few thousandths of the largest, and EPSILON damps small ones.
+    let of = |rate: f32| 0.02 * f64::from(rate);
+    let tolerances =
+        [RULE.mean_rate_m, RULE.log_scale_rate, RULE.rotation_rate, RULE.opacity_rate, RULE.sh_dc_rate].map(of);
+    check(&splats_of(&bench.splats.read(gpu).unwrap()), &splats, tolerances);
+}
+
+#[test]
+fn growth_matches_the_twin() {
+    const N_BEFORE: u32 = 700; // Three blocks, the last one part full.
+    const N_AFTER: u32 = 900;
+    let mut splats = even_scene(8, N_BEFORE as usize);
+    for ix in [0, 255, 256, 699] {
+        splats[ix].opacity_logit = -9.0; // Dead.
+    }
+    let mut random = scene::Random::new(9);
+    let errors: Vec<f32> = (0..N_BEFORE).map(|_| f32_of(random.uniform(0.0, 1.0).powi(8))).collect();
+    let mut bench = Bench::new(&GpuOptions::default(), &scene::tilted_view(), &arrays_of(&splats));
+    let gpu = bench.gpu.clone();
+    bench.splats = bench.splats.grown(&gpu, N_AFTER).unwrap();
+    let growth = Growth {
+        n_before: N_BEFORE,
+        n_after: N_AFTER,
+        key: 5,
+        capacity: bench.splats.capacity,
+        n_sh_rest: 45,
+        child_spread: 0.5,
+        least_opacity: 0.005,
+        unused: 0.0,
+    };
+    let expected = change::grow(&splats, &errors.iter().map(|error| f64::from(*error)).collect::<Vec<_>>(), &growth);
+    assert!(expected.margin > 1e-6, "a choice of f32 may differ: {}", expected.margin);
+    let families = expected.parents.iter().flatten().count();
+    assert_eq!(families, 204, "the dead and the new");
+
+    gpu.write(&bench.splats.error_sums, 0, bytemuck::cast_slice(&errors));
+    let words = |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n)).unwrap();
+    let buffers = GrowthBuffers {
+        growth: gpu.uniform_with("growth", &growth),
+        cumulative: words("cumulative", N_BEFORE),
+        block_weights: words("block_weights", N_BEFORE.div_ceil(256)),
+        n_children: words("n_children", N_BEFORE),
+        parents: words("parents", N_AFTER),
+    };
+    let mut passes = Passes::default();
+    grow(&gpu, &mut passes, &bench.learn, &bench.splats, &buffers, &growth);
+    passes.submit(&gpu);
+    bench.splats.set_n(&gpu, N_AFTER);
+    let parents: Vec<u32> = gpu.read(&buffers.parents, N_AFTER as usize).unwrap();
+    let expected_parents: Vec<u32> =
+        expected.parents.iter().map(|parent| parent.map_or(u32::MAX, |ix| u32::try_from(ix).unwrap())).collect();
+    assert_eq!(parents, expected_parents);
+    let sums: Vec<f32> = gpu.read(&bench.splats.error_sums, N_AFTER as usize).unwrap();
+    assert!(sums.iter().all(|sum| *sum == 0.0), "errors are counted anew");
+    check(&splats_of(&bench.splats.read(&gpu).unwrap()), &expected.splats, [2e-5, 2e-4, 1e-6, 1e-3, 1e-6]);
+}
+
+/// Bins by hand: a splat belongs to a tile when it reaches one of its pixels.
+#[test]
+fn tiles_list_every_splat_that_reaches_them_in_order_of_depth() {
+    /// Squared Mahalanobis distance within which f32 may decide either way.
+    const MARGIN: f64 = 1e-3;
+    let view = scene::tilted_view();
+    let splats = even_scene(10, 300);
+    let bench = Bench::new(&GpuOptions::default(), &view, &arrays_of(&splats));
+    bench.render();
+    let gpu = &bench.gpu;
+    let drawn: Vec<[[f32; 4]; 3]> = gpu.read(&bench.scratch.drawn, splats.len()).unwrap();
+    let n_tiles = view.size_px.map(|size| size.div_ceil(16));
+    let ranges: Vec<[u32; 2]> = gpu.read(&bench.frame.tile_ranges, (n_tiles[0] * n_tiles[1]) as usize).unwrap();
+    let n_isect = ranges.iter().map(|range| range[1]).max().unwrap();
+    let listed: Vec<u32> = gpu.read(&bench.scratch.sorted_splats, n_isect as usize).unwrap();
+    let (mut n_listed, mut n_needless) = (0, 0);
+    for (tile, range) in (0..).zip(&ranges) {
+        let list = &listed[range[0] as usize..range[1] as usize];
+        let depths: Vec<f32> = list.iter().map(|ix| drawn[*ix as usize][0][2]).collect();
+        // Depth keys leave out the last three bits.
+        assert!(depths.windows(2).all(|pair| pair[0] <= pair[1] * (1.0 + 1e-6)), "tile {tile} is out of order");
+        let corner = [tile % n_tiles[0] * 16, tile / n_tiles[0] * 16];
+        for (splat_ix, [place, conic, _]) in (0..).zip(&drawn) {
+            let [a, b, c, reach] = conic.map(f64::from);
+            let distance = |pixel: u32| {
+                let at = [corner[0] + pixel % 16, corner[1] + pixel / 16].map(|px| f64::from(px) + 0.5);
+                let [dx, dy] = [at[0] - f64::from(place[0]), at[1] - f64::from(place[1])];
+                a * dx * dx + 2.0 * b * dx * dy + c * dy * dy
+            };
+            let nearest = (0..256).map(distance).fold(f64::INFINITY, f64::min);
+            let n_times = list.iter().filter(|listed| **listed == splat_ix).count();
+            assert!(n_times <= 1, "tile {tile} lists splat {splat_ix} {n_times} times");
+            assert!(n_times == 1 || nearest > reach - MARGIN, "tile {tile} misses splat {splat_ix}");
+            n_listed += n_times;
+            n_needless += usize::from(n_times == 1 && nearest > reach + MARGIN);
+        }
+    }
+    assert!(n_listed > 300, "{n_listed} intersections");
+    assert!(n_needless * 20 < n_listed, "{n_needless} of {n_listed} reach no pixel");
+}

@@ -1,0 +1,153 @@
+//! The plain CPU version of what changes splats: the optimiser's step (update.wgsl) and growth (grow_*.wgsl).
+//!
+//! Source: Kingma and Ba 2015; Kheradmand et al. 2024 (3DGS-MCMC), sections 4.1 and 4.2; error in place of opacity as the
+//! measure of growth after Bulo et al. 2024.
+
+use super::random::{normal3, uniform3};
+use super::{Splat, SplatGrad};
+use crate::optim::reference::{Adam, Moments};
+use crate::splat::params::{Growth, Rule};
+use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+
+/// Running means of every value of one splat, in the order of [`values`].
+pub(crate) type SplatMoments = Vec<Moments>;
+
+/// Mean, log scale, rotation, opacity logit, then the coefficients of color.
+fn values(splat: &Splat) -> Vec<f64> {
+    let rest = splat.sh.as_flattened().iter().copied();
+    let shape = splat.mean.into_iter().chain(splat.log_scale).chain(splat.rotation_wxyz).chain([splat.opacity_logit]);
+    shape.chain(rest).collect()
+}
+
+fn sigmoid(x: f64) -> f64 {
+    1.0 / (1.0 + (-x).exp())
+}
+
+/// Moves one splat against its gradient; `step` counts from 0.
+pub(crate) fn update(
+    splat: &Splat,
+    gradient: &SplatGrad,
+    moments: &mut SplatMoments,
+    rule: &Rule,
+    step: u32,
+    splat_ix: u32,
+) -> Splat {
+    let [of_mean, of_scale, of_rotation, of_opacity, of_dc, of_rest, noise, final_frac] = [
+        rule.mean_rate_m,
+        rule.log_scale_rate,
+        rule.rotation_rate,
+        rule.opacity_rate,
+        rule.sh_dc_rate,
+        rule.sh_rest_rate,
+        rule.noise,
+        rule.final_mean_rate_frac,
+    ]
+    .map(f64::from);
+    let done = (f64::from(step) / f64::from(rule.n_planned_steps).max(1.0)).min(1.0);
+    let mean_rate = of_mean * final_frac.powf(done);
+    let opacity = sigmoid(splat.opacity_logit);
+    let mut gradient = gradient.clone();
+    gradient.opacity_logit += (1.0 + done) * f64::from(rule.opacity_cost) * opacity * (1.0 - opacity);
+    for axis in 0..3 {
+        gradient.log_scale[axis] += (1.0 + done) * f64::from(rule.scale_cost) * splat.log_scale[axis].exp();
+    }
+    let rates: Vec<f64> = [mean_rate; 3]
+        .into_iter()
+        .chain([of_scale; 3])
+        .chain([of_rotation; 4])
+        .chain([of_opacity])
+        .chain([of_dc; 3])
+        .chain(std::iter::repeat_n(of_rest, 3 * (splat.sh.len() - 1)))
+        .collect();
+    let mut moved = values(splat);
+    let adam = Adam { beta1: rule.betas[0].into(), beta2: rule.betas[1].into(), epsilon: rule.epsilon.into() };
+    adam.update_all(step + 1, &rates, &mut moved, &values(&gradient), moments);
+
+    let [w, x, y, z] = splat.rotation_wxyz;
+    let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+    let along = turn.inverse() * Vector3::from(normal3([splat_ix, step, rule.seed]));
+    let variance = Vector3::from(splat.log_scale.map(|scale| (2.0 * scale).exp()));
+    let loose = 1.0 / (1.0 + (100.0 * (opacity - 0.005)).exp());
+    let jitter = turn * variance.component_mul(&along) * (noise * mean_rate * loose);
+
+    let range = rule.log_scale_range.map(f64::from);
+    let norm = moved[6..10].iter().map(|part| part * part).sum::<f64>().sqrt();
+    Splat {
+        mean: std::array::from_fn(|axis| moved[axis] + jitter[axis]),
+        log_scale: std::array::from_fn(|axis| moved[3 + axis].clamp(range[0], range[1])),
+        rotation_wxyz: std::array::from_fn(|part| moved[6 + part] / norm),
+        opacity_logit: moved[10].clamp(-12.0, 12.0),
+        sh: moved[11..].as_chunks::<3>().0.to_vec(),
+    }
+}
+
+/// Larger families are treated as this large.
+const MOST_FAMILY: u32 = 16;
+
+/// Splats after a change of their number, and who came of whom.
+pub(crate) struct Grown {
+    pub(crate) splats: Vec<Splat>,
+    pub(crate) parents: Vec<Option<usize>>,
+    /// How near a choice of a parent came to another one, as a share of all error.
+    pub(crate) margin: f64,
+}
+
+/// Gives dead and new splats a parent, chosen by error, a place within it and their share of its light.
+pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
+    let is_dead = |splat: &Splat| sigmoid(splat.opacity_logit) < f64::from(growth.least_opacity);
+    let mut cumulative = Vec::with_capacity(splats.len());
+    let mut total = 0.0;
+    for (splat, error) in splats.iter().zip(errors) {
+        total += if is_dead(splat) { 0.0 } else { *error };
+        cumulative.push(total);
+    }
+    let mut grown = splats.to_vec();
+    grown.resize(growth.n_after as usize, Splat::default());
+    let mut parents = vec![None; grown.len()];
+    let mut n_children = vec![0u32; splats.len()];
+    let mut margin = f64::INFINITY;
+    for child in 0..growth.n_after {
+        let ix = child as usize;
+        if splats.get(ix).is_some_and(|splat| !is_dead(splat)) {
+            continue;
+        }
+        let wanted = uniform3([child, growth.key, 7])[0] * total;
+        let parent = cumulative.partition_point(|sum| *sum <= wanted);
+        let before = if parent > 0 { cumulative[parent - 1] } else { 0.0 };
+        margin = margin.min((cumulative[parent] - wanted).min(wanted - before) / total);
+        parents[ix] = Some(parent);
+        n_children[parent] += 1;
+        let [w, x, y, z] = splats[parent].rotation_wxyz;
+        let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+        let normal = normal3([child, growth.key, 11]);
+        let within: [f64; 3] =
+            std::array::from_fn(|axis| splats[parent].log_scale[axis].exp() * normal[axis].clamp(-2.0, 2.0));
+        let offset = turn * Vector3::from(within) * f64::from(growth.child_spread);
+        grown[ix] = splats[parent].clone();
+        for axis in 0..3 {
+            grown[ix].mean[axis] += offset[axis];
+        }
+    }
+    for (ix, splat) in grown.iter_mut().enumerate() {
+        let n = n_children.get(parents[ix].unwrap_or(ix)).copied().unwrap_or(0);
+        if n > 0 {
+            share_light(splat, (n + 1).min(MOST_FAMILY));
+        }
+    }
+    Grown { splats: grown, parents, margin }
+}
+
+/// Opacity and size of one of `n` splats that together look as the one did.
+fn share_light(splat: &mut Splat, n: u32) {
+    let opacity = sigmoid(splat.opacity_logit).clamp(1e-4, 0.9999);
+    let shared = (1.0 - (1.0 - opacity).powf(1.0 / f64::from(n))).clamp(0.005, 0.9999);
+    let choose = |n: u32, k: u32| (0..k).map(|i| f64::from(n - i) / f64::from(i + 1)).product::<f64>();
+    let term = |i: u32, k: u32| {
+        let sign = if k % 2 == 0 { 1.0 } else { -1.0 };
+        sign * choose(i - 1, k) * shared.powf(f64::from(k + 1)) / f64::from(k + 1).sqrt()
+    };
+    let weight: f64 = (1..=n).flat_map(|i| (0..i).map(move |k| term(i, k))).sum();
+    let shrink = (opacity / weight).clamp(0.05, 1.0).ln();
+    splat.log_scale = splat.log_scale.map(|scale| scale + shrink);
+    splat.opacity_logit = (shared / (1.0 - shared)).ln();
+}
