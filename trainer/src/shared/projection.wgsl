@@ -61,7 +61,7 @@ fn project_splat(view: View, mean: vec3f, rotation_wxyz: vec4f, log_scale: vec3f
     out.jacobian_x = vec3f(view.focal_px.x * inverse_z, 0.0, -view.focal_px.x * clamped.x * inverse_z);
     out.jacobian_y = vec3f(0.0, view.focal_px.y * inverse_z, -view.focal_px.y * clamped.y * inverse_z);
 
-    let camera = transpose(mat3x3f(view.camera_rows[0].xyz, view.camera_rows[1].xyz, view.camera_rows[2].xyz));
+    let camera = transpose(mat3x3f(view.camera_row_0.xyz, view.camera_row_1.xyz, view.camera_row_2.xyz));
     out.camera_rotation = camera - out.tau * (cross_matrix(view.shutter_angular.xyz) * camera);
     out.rotation = rotation_of(rotation_wxyz);
     out.scale = exp(log_scale);

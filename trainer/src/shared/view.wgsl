@@ -3,7 +3,9 @@
 // source    conventions of ARCHITECTURE.md: x right, y down, z forward; pixel centers at + 0.5
 
 struct View {
-    camera_rows: array<vec4f, 3>, // camera_from_world, upper three rows
+    camera_row_0: vec4f,       // camera_from_world, upper three rows
+    camera_row_1: vec4f,
+    camera_row_2: vec4f,
     center_in_world: vec4f,    // of the camera; w: low-pass on the image plane, pixels squared
     focal_px: vec2f,
     principal_px: vec2f,
@@ -11,7 +13,9 @@ struct View {
     n_tiles: vec2u,
     shutter_linear: vec4f,     // twist of the camera times the readout time, metres; w: near_m
     shutter_angular: vec4f,    // radians; w: far_m
-    crop_rows: array<vec4f, 3>, // box_from_world, upper three rows
+    crop_row_0: vec4f,         // box_from_world, upper three rows
+    crop_row_1: vec4f,
+    crop_row_2: vec4f,
     crop_min: vec4f,           // w: 1 when there is a crop box, else 0
     crop_max: vec4f,
 }
@@ -20,14 +24,14 @@ const TILE_PX = 16u;
 
 fn camera_from_world(view: View, point_in_world: vec3f) -> vec3f {
     let point = vec4f(point_in_world, 1.0);
-    return vec3f(dot(view.camera_rows[0], point), dot(view.camera_rows[1], point), dot(view.camera_rows[2], point));
+    return vec3f(dot(view.camera_row_0, point), dot(view.camera_row_1, point), dot(view.camera_row_2, point));
 }
 
 // Whether a point may be drawn.
 fn inside_crop(view: View, point_in_world: vec3f) -> bool {
     if view.crop_min.w == 0.0 { return true; }
     let point = vec4f(point_in_world, 1.0);
-    let point_in_box = vec3f(dot(view.crop_rows[0], point), dot(view.crop_rows[1], point), dot(view.crop_rows[2], point));
+    let point_in_box = vec3f(dot(view.crop_row_0, point), dot(view.crop_row_1, point), dot(view.crop_row_2, point));
     return all(point_in_box >= view.crop_min.xyz) && all(point_in_box <= view.crop_max.xyz);
 }
 

@@ -220,7 +220,9 @@ mod tests {
         assert_layout!(
             View,
             [
-                camera_rows,
+                camera_row_0,
+                camera_row_1,
+                camera_row_2,
                 center_in_world,
                 focal_px,
                 principal_px,
@@ -228,7 +230,9 @@ mod tests {
                 n_tiles,
                 shutter_linear,
                 shutter_angular,
-                crop_rows,
+                crop_row_0,
+                crop_row_1,
+                crop_row_2,
                 crop_min,
                 crop_max
             ]

@@ -11,7 +11,9 @@ pub(crate) const TILE_PX: u32 = 16;
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct View {
-    pub(crate) camera_rows: [[f32; 4]; 3],
+    pub(crate) camera_row_0: [f32; 4],
+    pub(crate) camera_row_1: [f32; 4],
+    pub(crate) camera_row_2: [f32; 4],
     pub(crate) center_in_world: [f32; 4],
     pub(crate) focal_px: [f32; 2],
     pub(crate) principal_px: [f32; 2],
@@ -19,7 +21,9 @@ pub(crate) struct View {
     pub(crate) n_tiles: [u32; 2],
     pub(crate) shutter_linear: [f32; 4],
     pub(crate) shutter_angular: [f32; 4],
-    pub(crate) crop_rows: [[f32; 4]; 3],
+    pub(crate) crop_row_0: [f32; 4],
+    pub(crate) crop_row_1: [f32; 4],
+    pub(crate) crop_row_2: [f32; 4],
     pub(crate) crop_min: [f32; 4],
     pub(crate) crop_max: [f32; 4],
 }
@@ -65,8 +69,12 @@ impl Camera {
         let center = f32s_of::<3>(self.world_from_camera.translation.vector.into());
         let with = |xyz: [f32; 3], w: f32| [xyz[0], xyz[1], xyz[2], w];
         let crop_w = if self.crop.is_some() { 1.0 } else { 0.0 };
+        let camera = rows_of(&self.world_from_camera.inverse());
+        let crop = rows_of(&self.crop.map_or(Transform::identity(), |crop| crop.world_from_box.inverse()));
         View {
-            camera_rows: rows_of(&self.world_from_camera.inverse()),
+            camera_row_0: camera[0],
+            camera_row_1: camera[1],
+            camera_row_2: camera[2],
             center_in_world: with(center, f32_of(self.low_pass_px2)),
             focal_px: f32s_of(self.focal_px),
             principal_px: f32s_of(self.principal_px),
@@ -74,7 +82,9 @@ impl Camera {
             n_tiles: self.size_px.map(|size| size.div_ceil(TILE_PX)),
             shutter_linear: with(linear, f32_of(self.near_m)),
             shutter_angular: with(angular, f32_of(self.far_m)),
-            crop_rows: rows_of(&self.crop.map_or(Transform::identity(), |crop| crop.world_from_box.inverse())),
+            crop_row_0: crop[0],
+            crop_row_1: crop[1],
+            crop_row_2: crop[2],
             crop_min: with(self.crop.map_or([0.0; 3], |crop| f32s_of(crop.min_m)), crop_w),
             crop_max: with(self.crop.map_or([0.0; 3], |crop| f32s_of(crop.max_m)), 0.0),
         }

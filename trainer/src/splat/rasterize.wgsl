@@ -49,7 +49,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         atomicStore(&wg_last, 0u);
     }
     let range = workgroupUniformLoad(&wg_range); // Also orders the zeroing before anyone adds.
-    let n_splats = range.y - range.x;
+    let n_splats = max(range.x, range.y) - range.x;
     let corner = vec2u(tile % view.n_tiles.x, tile / view.n_tiles.x) * TILE_PX;
     let first = corner + vec2u((lane % LANES_PER_ROW) * PX, lane / LANES_PER_ROW);
     let center_x = f32(first.x) + 0.5 + RAMP;

@@ -35,7 +35,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let in_grid = tile < view.n_tiles.x * view.n_tiles.y;
     var range = vec2u(0u);
     if in_grid && status[FAILED] == 0u { range = tile_ranges[tile]; }
-    let n_splats = range.y - range.x;
+    let n_splats = max(range.x, range.y) - range.x;
     var bucket = 0u;
     if STATES && in_grid { bucket = bucket_starts[tile]; }
     let corner = vec2u(tile % view.n_tiles.x, tile / view.n_tiles.x) * TILE_PX;

@@ -144,7 +144,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
             + v_jacobian_x.z * f.x * ratio.x * (1.0 + p.unclamped.x) / (z * z)
             + v_jacobian_y.z * f.y * ratio.y * (1.0 + p.unclamped.y) / (z * z);
         let v_still = v_point + p.tau * cross(view.shutter_angular.xyz, v_point);
-        v_mean = view.camera_rows[0].xyz * v_still.x + view.camera_rows[1].xyz * v_still.y + view.camera_rows[2].xyz * v_still.z;
+        v_mean = view.camera_row_0.xyz * v_still.x + view.camera_row_1.xyz * v_still.y + view.camera_row_2.xyz * v_still.z;
     }
 
     // Color: recomputed for its clamp at 0, and for the gradient through the direction.
