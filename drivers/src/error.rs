@@ -100,6 +100,12 @@ pub enum Error {
         /// The file.
         path: PathBuf,
     },
+    /// A recording was to be written over a file that is there.
+    #[error("{path:?} exists already: a recording only goes into a new file")]
+    Exists {
+        /// The file.
+        path: PathBuf,
+    },
     /// A recording cannot be written further, for instance because the disk is full.
     #[error("cannot write the recording {path:?}; what was written before stays readable")]
     Record {

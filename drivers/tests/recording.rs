@@ -185,11 +185,12 @@ fn what_is_no_recording_is_refused_in_one_sentence() {
 }
 
 #[test]
-fn a_full_disk_is_told_when_it_happens() {
-    let Ok(mut recorder) = Recorder::create(Path::new("/dev/full"), &About::default()) else {
-        return; // Told at once, which is as good: the header did not fit.
-    };
-    let told = samples().iter().map(|sample| recorder.write(sample)).find_map(Result::err);
-    let told = told.expect("nothing fits on a full disk").to_string();
-    assert!(told.contains("/dev/full") && told.contains("stays readable"), "{told}");
+fn an_existing_file_is_refused_and_left_as_it_was() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    record(&path, &samples());
+    let before = std::fs::read(&path).expect("the file");
+    let refused = Recorder::create(&path, &About::default()).expect_err("the file is there");
+    assert!(matches!(refused, Error::Exists { .. }) && refused.to_string().contains("run.mcap"), "{refused}");
+    assert!(std::fs::read(&path).expect("the file") == before);
 }

@@ -9,7 +9,7 @@ use kinematics::{Intrinsics, Stamp};
 use mcap::records::MessageHeader;
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{BufWriter, Seek, Write};
+use std::io::{BufWriter, ErrorKind, Seek, Write};
 use std::path::{Path, PathBuf};
 
 const CHUNK_BYTES: u64 = 4 << 20;
@@ -43,9 +43,12 @@ trait Sink: Write + Seek + Send {}
 impl<W: Write + Seek + Send> Sink for W {}
 
 impl Recorder {
-    /// Begins a recording; an existing file of that name is replaced.
+    /// Begins a recording in a new file; an existing one is refused, for it may be the very recording that is replayed.
     pub fn create(path: &Path, about: &About<'_>) -> Result<Self, Error> {
-        let file = File::create(path).map_err(|source| Error::Open { path: path.to_owned(), source })?;
+        let file = File::create_new(path).map_err(|source| match source.kind() {
+            ErrorKind::AlreadyExists => Error::Exists { path: path.to_owned() },
+            _ => Error::Open { path: path.to_owned(), source },
+        })?;
         Self::to(Box::new(BufWriter::new(file)), path, about)
     }
 
@@ -200,7 +203,7 @@ mod tests {
     use crate::Source;
     use crate::recording::Recording;
     use kinematics::JointState;
-    use std::io::{Error as IoError, ErrorKind, SeekFrom};
+    use std::io::{Error as IoError, SeekFrom};
 
     /// A file on a disk that is full after some bytes.
     struct Full {
