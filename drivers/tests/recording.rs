@@ -101,6 +101,7 @@ fn a_replay_is_what_was_recorded_in_the_same_order() {
     }
     assert_eq!(recording.damage(), None);
     assert_eq!(recording.attachment(RIG_FILE), Some(RIG.as_bytes()));
+    assert_eq!(recording.joint_names(), Some(&["a".to_owned(), "b".to_owned()][..]));
     let again = folder.path().join("again.mcap");
     record(&again, &read);
     assert!(

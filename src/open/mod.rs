@@ -9,6 +9,7 @@ use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Rig};
 use anyhow::{Context, bail};
 use drivers::recording::{About, RIG_FILE, Recorder, Recording, URDF_FILE};
 use drivers::{Error, Sample, Source};
+use kinematics::Chain;
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
@@ -46,13 +47,17 @@ pub(crate) fn rig(mut rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
     Ok(Opened { rig, source, damage: Arc::default() })
 }
 
-/// Opens a recording with the rig stored in it, or with another one.
+/// Opens a recording with the rig stored in it, or with another one; which joint is which, the recording knows.
 pub(crate) fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> anyhow::Result<Opened> {
     let recording = Recording::open(path)?;
-    let rig = match rig {
+    let mut rig = match rig {
         Some(rig) => rig,
         None => stored_rig(path, &recording, overrides)?,
     };
+    if let Some(recorded) = recording.joint_names() {
+        chain_of(&rig)?.order_in(recorded).with_context(|| format!("the recording {path:?} does not fit the robot"))?;
+        rig.arm.joints = recorded.to_vec();
+    }
     let damage = Arc::default();
     let source = Box::new(Replay { recording, damage: Arc::clone(&damage) });
     Ok(Opened { rig, source, damage })
@@ -68,6 +73,12 @@ pub(crate) fn recorder(path: &Path, rig: &Rig) -> anyhow::Result<Recorder> {
         joint_names: &rig.arm.joints,
     };
     Ok(Recorder::create(path, &about)?)
+}
+
+/// The joints from the robot's base to its flange.
+fn chain_of(rig: &Rig) -> anyhow::Result<Chain> {
+    let arm = &rig.arm;
+    Chain::from_urdf(&arm.urdf_text, &arm.base_link, &arm.flange_link).context("the arm's URDF")
 }
 
 fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> anyhow::Result<Rig> {
@@ -166,6 +177,14 @@ mod tests {
         assert_eq!(opened.source.next_sample().expect("readable"), Some(Sample::Joints(joints)));
         assert_eq!(opened.source.next_sample().expect("readable"), None);
         assert_eq!(opened.damage.get(), None);
+        // Another order in the rig file changes nothing; a joint of another name does.
+        let mut reversed = rig.clone();
+        reversed.arm.joints.reverse();
+        assert_eq!(recording(&path, Some(reversed), &[]).expect("the same joints").rig, rig);
+        let mut renamed = rig;
+        renamed.arm.urdf_text = renamed.arm.urdf_text.replace("panda_joint3", "elbow");
+        let refused = format!("{:#}", recording(&path, Some(renamed), &[]).err().expect("no joint of that name"));
+        assert!(refused.contains("run.mcap") && refused.contains("\"elbow\""), "{refused}");
         let overridden = recording(&path, None, &[Override::new("train.seed", 9)]).expect("a recording");
         assert_eq!(overridden.rig.train.seed, 9);
     }

@@ -3,7 +3,7 @@
 //! The file is read from front to back without its index, so a recording that was cut off anywhere gives every sample
 //! before the cut.
 
-use super::topic::Topic;
+use super::topic::{JOINT_NAMES, Topic};
 use crate::wire::{Malformed, foxglove, joint_state};
 use crate::{BasePose, Error, Image, Sample, Source, TruthImage};
 use mcap::McapError;
@@ -27,6 +27,7 @@ pub struct Recording {
     schemas: BTreeMap<u16, String>,
     channels: BTreeMap<u16, Channel>,
     attachments: BTreeMap<String, Vec<u8>>,
+    joint_names: Option<Vec<String>>,
     /// Parts of the ground truth that is not complete yet.
     true_color: Option<Image>,
     true_depth_m: Option<Arc<[f32]>>,
@@ -73,6 +74,7 @@ impl Recording {
             schemas: BTreeMap::new(),
             channels: BTreeMap::new(),
             attachments: BTreeMap::new(),
+            joint_names: None,
             true_color: None,
             true_depth_m: None,
             first: None,
@@ -90,6 +92,11 @@ impl Recording {
     /// A file kept in the recording, such as [`super::RIG_FILE`].
     pub fn attachment(&self, name: &str) -> Option<&[u8]> {
         self.attachments.get(name).map(Vec::as_slice)
+    }
+
+    /// Names of the joints in the order of the readings, where the recording tells them; known from the first sample on.
+    pub fn joint_names(&self) -> Option<&[String]> {
+        self.joint_names.as_deref()
     }
 
     /// Says how the file is damaged and how much of it could be read; known once the samples have ended.
@@ -140,6 +147,9 @@ impl Recording {
             }
             Record::Channel(channel) => {
                 if let Some(topic) = Topic::from_name(&channel.topic) {
+                    if let (Topic::Joints, Some(names)) = (&topic, channel.metadata.get(JOINT_NAMES)) {
+                        self.joint_names = Some(names.split(',').map(str::to_owned).collect());
+                    }
                     let schema_name = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
                     self.channels.insert(channel.id, Channel { topic, topic_name: channel.topic, schema_name });
                 }

@@ -2,6 +2,9 @@
 
 use crate::wire::{descriptor, joint_state};
 
+/// Key of the joints' names, separated by commas, in the metadata of their channel.
+pub(super) const JOINT_NAMES: &str = "joint_names";
+
 /// What the messages of a topic are.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Topic {

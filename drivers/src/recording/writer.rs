@@ -2,7 +2,7 @@
 //!
 //! Chunks are closed at least once a second of sample time, so whatever stops the program costs at most that second.
 
-use super::topic::{Encoding, Topic};
+use super::topic::{Encoding, JOINT_NAMES, Topic};
 use crate::wire::{descriptor, foxglove, joint_state};
 use crate::{Error, Image, PixelFormat, Sample, TruthImage};
 use kinematics::{Intrinsics, Stamp};
@@ -99,6 +99,10 @@ impl Recorder {
 
     fn try_write(&mut self, sample: &Sample) -> mcap::McapResult<()> {
         let stamp = sample.stamp();
+        if self.n_messages == 0 && !self.joint_names.is_empty() {
+            // Before all samples, so that who opens the file knows the joints at once.
+            self.joints_channel()?;
+        }
         for (camera, intrinsics) in std::mem::take(&mut self.cameras) {
             let message = foxglove::encode_calibration(&camera, stamp, &intrinsics);
             self.put(Topic::Calibration(camera), descriptor::CAMERA_CALIBRATION, stamp, &message)?;
@@ -110,8 +114,7 @@ impl Recorder {
                 self.put_image(topic, image)?;
             }
             Sample::Joints(state) => {
-                let channel =
-                    self.channel(Topic::Joints, Encoding::joint_state(), "joint_names", &self.joint_names.clone())?;
+                let channel = self.joints_channel()?;
                 self.append(channel, stamp, &joint_state::encode(state))?;
             }
             Sample::Base(pose) => {
@@ -154,6 +157,11 @@ impl Recorder {
     fn put(&mut self, topic: Topic, schema: descriptor::Schema, stamp: Stamp, message: &[u8]) -> mcap::McapResult<()> {
         let channel = self.channel(topic, Encoding::protobuf(schema), "", "")?;
         self.append(channel, stamp, message)
+    }
+
+    fn joints_channel(&mut self) -> mcap::McapResult<u16> {
+        let names = self.joint_names.clone();
+        self.channel(Topic::Joints, Encoding::joint_state(), JOINT_NAMES, &names)
     }
 
     /// The channel of a topic, announced in the file when it is new; `key` and `value` go into its metadata.
