@@ -23,8 +23,10 @@ pub struct Config {
     pub duration_secs: Option<f64>,
     /// The rig ends once the first camera has delivered this many colour images.
     pub n_images: Option<u64>,
-    /// Names of the arm's joints in the joint readings, from base to flange.
+    /// Names of the arm's joints from base to flange.
     pub joint_names: Vec<String>,
+    /// The same names in the order of the joint readings.
+    pub reading_order: Vec<String>,
     /// The cameras, each with its own name.
     pub cameras: Vec<CameraConfig>,
 }
@@ -180,12 +182,22 @@ impl Default for Config {
             duration_secs: None,
             n_images: None,
             joint_names: (1..=7).map(|ix| format!("panda_joint{ix}")).collect(),
+            reading_order: (1..=7).map(|ix| format!("panda_joint{ix}")).collect(),
             cameras: vec![CameraConfig::wrist("wrist")],
         }
     }
 }
 
 impl Config {
+    /// Which joint, counted from the base, each number of a reading is of.
+    pub(crate) fn joint_ixs(&self) -> Result<Vec<usize>, Error> {
+        let find = |name: &String| {
+            let unknown = || Error::UnknownJoint { joint: name.clone(), known: self.joint_names.clone() };
+            self.joint_names.iter().position(|known| known == name).ok_or_else(unknown)
+        };
+        self.reading_order.iter().map(find).collect()
+    }
+
     /// Says what is wrong with the numbers before MuJoCo, which would abort the process, sees them.
     pub fn check(&self) -> Result<(), Error> {
         check("sim", "speed", self.speed, 0.01, 2.0)?;
@@ -195,6 +207,7 @@ impl Config {
         if self.joint_names.len() != N_JOINTS {
             return Err(Error::NJoints { got: self.joint_names.len(), expected: N_JOINTS });
         }
+        self.joint_ixs()?;
         if self.cameras.is_empty() {
             return Err(Error::NoCamera);
         }

@@ -19,6 +19,8 @@ pub(crate) type Delivery = (i64, Sample);
 /// A rig in motion.
 pub(crate) struct Engine {
     config: Config,
+    /// Which joint each number of a reading is of.
+    joint_ixs: Vec<usize>,
     arm: Arm,
     cameras: Vec<Camera>,
     renderer: Renderer,
@@ -174,8 +176,9 @@ impl Cameras {
 }
 
 impl Engine {
-    pub(crate) fn new(config: Config, arm: Arm, cameras: Cameras, renderer: Renderer) -> Self {
-        Self {
+    pub(crate) fn new(config: Config, arm: Arm, cameras: Cameras, renderer: Renderer) -> Result<Self, Error> {
+        Ok(Self {
+            joint_ixs: config.joint_ixs()?,
             config,
             arm,
             cameras: cameras.0,
@@ -188,7 +191,7 @@ impl Engine {
             ready: VecDeque::new(),
             n_images: 0,
             has_ended: false,
-        }
+        })
     }
 
     pub(crate) fn renderer_name(&self) -> &str {
@@ -339,11 +342,12 @@ impl Engine {
     }
 
     fn joint_state(&self, reading: &Reading) -> JointState {
+        let ordered = |joints: &Joints| self.joint_ixs.iter().map(|ix| joints[*ix]).collect();
         JointState {
             stamp: Stamp(self.start.0 + reading.nanos),
-            position: reading.position_rad.as_slice().to_vec(),
-            velocity: reading.velocity_rad_s.as_slice().to_vec(),
-            effort: reading.torque_nm.as_slice().to_vec(),
+            position: ordered(&reading.position_rad),
+            velocity: ordered(&reading.velocity_rad_s),
+            effort: ordered(&reading.torque_nm),
         }
     }
 }

@@ -26,6 +26,14 @@ pub enum Error {
         /// Joints of the arm.
         expected: usize,
     },
+    /// A joint is to be read that the arm does not have.
+    #[error("the simulated arm has no joint {joint:?}, its joints are: {}", .known.join(", "))]
+    UnknownJoint {
+        /// Name given.
+        joint: String,
+        /// Names of the arm's joints.
+        known: Vec<String>,
+    },
     /// Nothing to render.
     #[error("a simulated rig needs at least one camera")]
     NoCamera,

@@ -62,10 +62,10 @@ pub fn open(config: &Config) -> Result<Rig, Error> {
     let renderer = Renderer::start(Arc::clone(&model))?;
     let follower = Follower::new(Scan::new(config.speed), scanning_camera(config))?;
     let arm = Arm::new(model, follower, history_nanos(config))?;
-    let engine = Engine::new(config.clone(), arm, cameras, renderer);
+    let engine = Engine::new(config.clone(), arm, cameras, renderer)?;
     let info = RigInfo {
         cameras: config.cameras.iter().map(|camera| camera_info(camera, config.ideal)).collect(),
-        joint_names: config.joint_names.clone(),
+        joint_names: config.reading_order.clone(),
         urdf: PANDA_URDF,
         world_from_base: Transform::identity(),
         renderer: engine.renderer_name().to_owned(),

@@ -72,7 +72,8 @@ fn config_of(rig: &Rig) -> anyhow::Result<sim::Config> {
         speed: rig.sim.speed,
         duration_secs: rig.sim.duration_secs,
         n_images: rig.sim.n_images,
-        joint_names: rig.arm.joints.clone(),
+        joint_names: super::chain_of(rig)?.joint_names().to_vec(),
+        reading_order: rig.arm.joints.clone(),
         cameras: rig.cameras.iter().map(camera_of).collect::<Result<_, _>>()?,
     })
 }

@@ -83,6 +83,20 @@ fn forward_kinematics_agrees_with_the_simulator() {
 }
 
 #[test]
+fn readings_come_in_the_order_of_the_rig_file() {
+    const CLOSE_M: f64 = 1e-4; // As with joints in their own order.
+    let rig = small("static-arm.toml", &[Override::new("sim.n_images", 12), Override::new("sim.ideal", true)]);
+    let reversed: Vec<String> = rig.arm.joints.iter().rev().cloned().collect();
+    let rig = Rig { arm: crate::config::Arm { joints: reversed, ..rig.arm.clone() }, ..rig };
+    let (keyframes, join) = keyframes(super::rig(rig, Devices::Sim).expect("the simulator"), |_| {});
+    let apart_m = |keyframe: &Arc<Keyframe>| {
+        let truth = keyframe.truth.as_ref().expect("ground truth comes beside the images");
+        (truth.world_from_camera.translation.vector - keyframe.world_from_camera.translation.vector).norm()
+    };
+    assert!(keyframes.len() > 3 && keyframes.iter().all(|keyframe| apart_m(keyframe) < CLOSE_M), "{}", join.counts());
+}
+
+#[test]
 fn two_cameras_keep_their_own_size_rate_and_kind() {
     let rig = small("two-cameras.toml", &[Override::new("sim.duration_secs", 4)]);
     let (keyframes, join) = keyframes(super::rig(rig, Devices::Sim).expect("the simulator"), |_| {});
