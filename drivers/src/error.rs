@@ -4,6 +4,24 @@ use kinematics::Stamp;
 use std::path::PathBuf;
 use std::time::Duration;
 
+/// How much of a recording has reached the file.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Kept {
+    /// Samples that can be read.
+    pub n_samples: u64,
+    /// From the first of their stamps to the last, seconds.
+    pub seconds: f64,
+}
+
+impl std::fmt::Display for Kept {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self.n_samples {
+            0 => f.write_str("nothing of it is kept"),
+            n_samples => write!(f, "which keeps the first {:.1} s ({n_samples} samples)", self.seconds),
+        }
+    }
+}
+
 /// Errors of devices, recordings and datasets.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -107,12 +125,14 @@ pub enum Error {
         path: PathBuf,
     },
     /// A recording cannot be written further, for instance because the disk is full.
-    #[error("cannot write the recording {path:?}; what was written before stays readable")]
+    #[error("cannot write the recording {path:?}, {kept}")]
     Record {
         /// The file.
         path: PathBuf,
+        /// What of it can be read.
+        kept: Kept,
         /// Why.
-        source: mcap::McapError,
+        source: std::io::Error,
     },
     /// A recording cannot be read further for another reason than its end.
     #[error("cannot read the recording {path:?}")]

@@ -8,7 +8,7 @@ pub mod recording;
 mod sample;
 pub mod wire;
 
-pub use error::Error;
+pub use error::{Error, Kept};
 pub use live::Live;
 pub use sample::{BasePose, Image, PixelFormat, Sample, TruthImage};
 

@@ -181,7 +181,9 @@ fn what_is_no_recording_is_refused_in_one_sentence() {
         assert!(matches!(refused, Error::NotARecording { .. }), "{refused}");
     }
     let empty = folder.path().join("empty.mcap");
-    record(&empty, &[]);
+    record(&empty, &samples());
+    let bytes = std::fs::read(&empty).expect("the file");
+    std::fs::write(&empty, &bytes[..100]).expect("a shorter file");
     assert!(matches!(Recording::open(&empty), Err(Error::EmptyRecording { .. })));
 }
 

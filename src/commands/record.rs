@@ -1,11 +1,10 @@
 //! `fieldrig record`: what the devices say, into a file, and nothing else.
 
 use crate::config::{Override, Rig};
-use crate::exit::Exit;
+use crate::exit::{Exit, LackOfEvidence};
 use crate::open::{self, Devices, Opened};
 use crate::print;
 use crate::stop::Stop;
-use anyhow::Context;
 use drivers::Sample;
 use kinematics::Stamp;
 use serde::Serialize;
@@ -85,17 +84,17 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         if args.seconds.is_some_and(|seconds| recorded.seconds > seconds) {
             break;
         }
-        recorder
-            .write(&sample)
-            .with_context(|| format!("{} holds the first {:.1} s only", args.out.display(), recorded.seconds))?;
+        recorder.write(&sample)?;
         recorded.count(&sample);
         bar.set_message(format!("{} images, {} joint states", recorded.images, recorded.joint_states));
     }
     bar.finish_and_clear();
-    recorder.finish().with_context(|| format!("{} has no index, but can be read", args.out.display()))?;
+    let kept = recorder.finish()?;
     if let Some(error) = input_error {
-        return Err(anyhow::Error::new(error)
-            .context(format!("the devices broke off; {} keeps what came before", args.out.display())));
+        return Err(anyhow::Error::new(error).context(format!("the devices broke off; {}, {kept}", args.out.display())));
+    }
+    if kept.n_samples == 0 {
+        return Err(LackOfEvidence(format!("no sample came, so {} was not written", args.out.display())).into());
     }
     if args.json {
         print::json(&recorded)?;

@@ -4,8 +4,9 @@
 
 use super::topic::{Encoding, JOINT_NAMES, Topic};
 use crate::wire::{descriptor, foxglove, joint_state};
-use crate::{Error, Image, PixelFormat, Sample, TruthImage};
+use crate::{Error, Image, Kept, PixelFormat, Sample, TruthImage};
 use kinematics::{Intrinsics, Stamp};
+use mcap::McapError;
 use mcap::records::MessageHeader;
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -29,6 +30,7 @@ pub struct About<'a> {
 /// A recording being written.
 ///
 /// After an error nothing more can be written; what was written before stays readable. Dropping it finishes the file.
+/// A file in which no sample has arrived is removed when writing fails or ends.
 pub struct Recorder {
     path: PathBuf,
     mcap: mcap::Writer<Box<dyn Sink>>,
@@ -36,7 +38,13 @@ pub struct Recorder {
     cameras: Vec<(String, Intrinsics)>,
     joint_names: String,
     n_messages: u32,
-    flushed: Option<Stamp>,
+    /// Samples written, some of them only into the open chunk, and their stamps' range.
+    n_samples: u64,
+    stamps: Option<[Stamp; 2]>,
+    /// What the closed chunks hold.
+    kept: Kept,
+    open_bytes: u64,
+    open_since: Option<Stamp>,
 }
 
 trait Sink: Write + Seek + Send {}
@@ -49,11 +57,15 @@ impl Recorder {
             ErrorKind::AlreadyExists => Error::Exists { path: path.to_owned() },
             _ => Error::Open { path: path.to_owned(), source },
         })?;
-        Self::to(Box::new(BufWriter::new(file)), path, about)
+        let recorder = Self::to(Box::new(BufWriter::new(file)), path, about);
+        if recorder.is_err() {
+            remove_stub(path);
+        }
+        recorder
     }
 
     fn to(sink: Box<dyn Sink>, path: &Path, about: &About<'_>) -> Result<Self, Error> {
-        let recorder = |source| Error::Record { path: path.to_owned(), source };
+        let recorder = |error| Error::Record { path: path.to_owned(), kept: Kept::default(), source: cause(error) };
         let options = mcap::WriteOptions::new()
             .profile("fieldrig")
             .compression(None)
@@ -82,19 +94,48 @@ impl Recorder {
                 .collect(),
             joint_names: about.joint_names.join(","),
             n_messages: 0,
-            flushed: None,
+            n_samples: 0,
+            stamps: None,
+            kept: Kept::default(),
+            open_bytes: 0,
+            open_since: None,
         })
     }
 
     /// Appends one sample.
     pub fn write(&mut self, sample: &Sample) -> Result<(), Error> {
-        self.try_write(sample).map_err(|source| Error::Record { path: self.path.clone(), source })
+        self.try_write(sample).map_err(|error| self.broken(error))
     }
 
     /// Writes the index that viewers seek by, and tells whether everything could be written.
-    pub fn finish(mut self) -> Result<(), Error> {
-        let finished = self.mcap.finish().and_then(|_| Ok(self.mcap.into_inner().flush()?));
-        finished.map_err(|source| Error::Record { path: self.path, source })
+    ///
+    /// Gives what was kept: everything.
+    pub fn finish(mut self) -> Result<Kept, Error> {
+        self.close_chunk().map_err(|error| self.broken(error))?;
+        self.mcap.finish().map_err(|error| self.broken(error))?;
+        let Self { path, mcap, kept, .. } = self;
+        mcap.into_inner().flush().map_err(|source| Error::Record { path: path.clone(), kept, source })?;
+        if kept.n_samples == 0 {
+            remove_stub(&path);
+        }
+        Ok(kept)
+    }
+
+    /// What to say of a failure; a file that holds nothing goes.
+    fn broken(&self, error: McapError) -> Error {
+        if self.kept.n_samples == 0 {
+            remove_stub(&self.path);
+        }
+        Error::Record { path: self.path.clone(), kept: self.kept, source: cause(error) }
+    }
+
+    /// Brings everything written so far into the file.
+    fn close_chunk(&mut self) -> mcap::McapResult<()> {
+        self.mcap.flush()?;
+        let seconds = self.stamps.map_or(0.0, |[first, last]| (last.0 - first.0) as f64 * 1e-9);
+        self.kept = Kept { n_samples: self.n_samples, seconds };
+        self.open_bytes = 0;
+        Ok(())
     }
 
     fn try_write(&mut self, sample: &Sample) -> mcap::McapResult<()> {
@@ -123,10 +164,13 @@ impl Recorder {
             }
             Sample::Truth(truth) => self.put_truth(truth)?,
         }
-        let flushed = *self.flushed.get_or_insert(stamp);
-        if stamp.0.saturating_sub(flushed.0) >= FLUSH_NANOS {
-            self.mcap.flush()?;
-            self.flushed = Some(stamp);
+        self.n_samples += 1;
+        let [first, last] = self.stamps.unwrap_or([stamp; 2]);
+        self.stamps = Some([first.min(stamp), last.max(stamp)]);
+        let open_since = *self.open_since.get_or_insert(stamp);
+        if self.open_bytes >= CHUNK_BYTES || stamp.0.saturating_sub(open_since.0) >= FLUSH_NANOS {
+            self.close_chunk()?;
+            self.open_since = Some(stamp);
         }
         Ok(())
     }
@@ -183,6 +227,7 @@ impl Recorder {
         let log_time = u64::try_from(stamp.0).unwrap_or(0);
         let header = MessageHeader { channel_id, sequence: self.n_messages, log_time, publish_time: log_time };
         self.n_messages = self.n_messages.wrapping_add(1);
+        self.open_bytes += message.len() as u64;
         self.mcap.write_to_known_channel(&header, message)
     }
 }
@@ -193,6 +238,23 @@ impl std::fmt::Debug for Recorder {
             .field("path", &self.path)
             .field("n_messages", &self.n_messages)
             .finish_non_exhaustive()
+    }
+}
+
+/// The file's own error where there is one: the rest is the format's, and says less.
+fn cause(error: McapError) -> std::io::Error {
+    match error {
+        McapError::Io(io) => io,
+        other => std::io::Error::other(other),
+    }
+}
+
+/// Removes a file that no sample has reached.
+fn remove_stub(path: &Path) {
+    if let Err(error) = std::fs::remove_file(path)
+        && error.kind() != ErrorKind::NotFound
+    {
+        log::warn!("the empty recording {path:?} stays: {error}");
     }
 }
 
@@ -252,17 +314,38 @@ mod tests {
             Sample::Joints(JointState { stamp: Stamp(ix * 1_000_000), position, velocity: vec![], effort: vec![] })
         };
         let told = (0..20_000).map(|ix| recorder.write(&reading(ix))).find_map(Result::err).expect("the disk is full");
-        assert!(told.to_string().contains("run.mcap") && told.to_string().contains("stays readable"), "{told}");
-        let cause = std::error::Error::source(&told).and_then(|cause| cause.source()).map(ToString::to_string);
+        let Error::Record { kept, .. } = told else { panic!("{told}") };
+        let sentence = format!("run.mcap\", which keeps the first 1.0 s ({} samples)", kept.n_samples);
+        assert!(told.to_string().ends_with(&sentence), "{told}");
+        let cause = std::error::Error::source(&told).map(ToString::to_string);
         assert!(cause.is_some_and(|cause| cause.contains("no storage space")), "{told:?}");
         assert!(recorder.write(&reading(0)).is_err(), "it stays failed");
         drop(recorder);
         let mut recording = Recording::open(&path).expect("a recording");
-        let mut n_samples = 0;
+        let mut n_samples = 0_i64;
         while let Some(sample) = recording.next_sample().expect("readable") {
             assert_eq!(sample, reading(n_samples));
             n_samples += 1;
         }
-        assert!(n_samples > 1000 && recording.damage().is_some(), "{n_samples} samples");
+        // The chunk that broke off may give a few more.
+        assert!(kept.n_samples > 1000 && n_samples.unsigned_abs() >= kept.n_samples, "{n_samples} of {kept:?}");
+        assert!(recording.damage().is_some());
+    }
+
+    #[test]
+    fn a_recording_without_samples_leaves_no_file() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("run.mcap");
+        let recorder = Recorder::create(&path, &About::default()).expect("a new file");
+        assert_eq!(recorder.finish().expect("room on the disk"), Kept::default());
+        assert!(!path.exists());
+        let sink = Box::new(Full { file: File::create(&path).expect("a new file"), left: 1000 });
+        let mut recorder = Recorder::to(sink, &path, &About::default()).expect("room for the header");
+        let reading = |ix: i64| {
+            let position = vec![0.25; 7];
+            Sample::Joints(JointState { stamp: Stamp(ix * 1_000_000), position, velocity: vec![], effort: vec![] })
+        };
+        let told = (0..2000).map(|ix| recorder.write(&reading(ix))).find_map(Result::err).expect("the disk is full");
+        assert!(told.to_string().ends_with("nothing of it is kept") && !path.exists(), "{told}");
     }
 }
