@@ -132,6 +132,40 @@ fn tells_what_a_cut_off_recording_lost(folder: &Path) {
 }
 
 #[test]
+fn record_names_its_losses_and_spares_what_is_there() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    rig_file(folder);
+    let rig = std::fs::read_to_string(folder.join("rig.toml")).expect("a rig file");
+    let mut rig: toml::Table = rig.parse().expect("TOML");
+    let sim = rig["sim"].as_table_mut().expect("a simulation");
+    sim.insert("ideal".into(), false.into());
+    let wrist = rig["camera"]["wrist"].as_table_mut().expect("a camera");
+    let flaws = wrist.entry("sim").or_insert_with(|| toml::Table::new().into());
+    flaws.as_table_mut().expect("a table").insert("dropped_frac".into(), 0.4.into());
+    std::fs::write(folder.join("rig.toml"), rig.to_string()).expect("room on the disk");
+
+    let record = ["record", "rig.toml", "--sim", "--out", "scan.mcap", "--json"];
+    let output = fieldrig(folder, &record);
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(3), "{told}");
+    let done: Value = serde_json::from_slice(&output.stdout).expect("a JSON object");
+    assert_eq!((done["images"].as_i64(), done["depth_images"].as_i64()), (Some(N_IMAGES), Some(N_IMAGES)));
+    let n_lost = done["lost"]["wrist"]["images"].as_u64().expect("a number");
+    assert!(n_lost > 0 && told.contains(&format!("camera \"wrist\" lost {n_lost} color")), "{told}");
+
+    let before = std::fs::read(folder.join("scan.mcap")).expect("a recording");
+    let itself = ["run", "rig.toml", "--from", "scan.mcap", "--record", "scan.mcap", "--listen", "127.0.0.1:0"];
+    for again in [&record[..], &itself[..]] {
+        let refused = fieldrig(folder, again);
+        let told = String::from_utf8_lossy(&refused.stderr);
+        assert_eq!(refused.status.code(), Some(1), "{told}");
+        assert!(told.contains("\"scan.mcap\" exists already"), "{told}");
+    }
+    assert!(std::fs::read(folder.join("scan.mcap")).expect("a recording") == before);
+}
+
+#[test]
 fn an_interrupted_run_saves_model_and_recording() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();

@@ -5,9 +5,10 @@ use crate::exit::{Exit, LackOfEvidence};
 use crate::open::{self, Devices, Opened};
 use crate::print;
 use crate::stop::Stop;
-use drivers::Sample;
+use drivers::{Image, Sample};
 use kinematics::Stamp;
 use serde::Serialize;
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 /// Flags of `record`.
@@ -37,25 +38,63 @@ pub(crate) struct Args {
 struct Recorded {
     event: &'static str,
     seconds: f64,
+    /// Colour images.
     images: u64,
+    depth_images: u64,
+    /// Colour images that the devices lost, or that a slow disk made them lose; then by camera.
     images_lost_by_devices: u64,
+    lost: BTreeMap<String, Lost>,
     joint_states: u64,
     base_poses: u64,
     truths: u64,
     out: PathBuf,
 }
 
+/// Images of one camera that did not come.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+struct Lost {
+    images: u64,
+    depth_images: u64,
+}
+
 impl Recorded {
     fn count(&mut self, sample: &Sample) {
         match sample {
             Sample::Image(image) => {
-                self.images += 1;
-                self.images_lost_by_devices += image.n_skipped;
+                self.depth_images += u64::from(image.is_depth());
+                self.images += u64::from(!image.is_depth());
+                self.count_lost(image);
             }
             Sample::Joints(_) => self.joint_states += 1,
             Sample::Base(_) => self.base_poses += 1,
             Sample::Truth(_) => self.truths += 1,
         }
+    }
+
+    fn count_lost(&mut self, next: &Image) {
+        if next.n_skipped == 0 {
+            return;
+        }
+        let lost = self.lost.entry(next.camera.to_string()).or_default();
+        if next.is_depth() {
+            lost.depth_images += next.n_skipped;
+        } else {
+            lost.images += next.n_skipped;
+            self.images_lost_by_devices += next.n_skipped;
+        }
+    }
+
+    fn summary(&self) -> String {
+        let Self { images, depth_images, joint_states, .. } = self;
+        format!("{images} color images, {depth_images} depth images, {joint_states} joint states")
+    }
+
+    /// What did not come, a sentence a camera.
+    fn losses(&self) -> Vec<String> {
+        let sentence = |(camera, lost): (&String, &Lost)| {
+            format!("camera {camera:?} lost {} color and {} depth images", lost.images, lost.depth_images)
+        };
+        self.lost.iter().map(sentence).collect()
     }
 }
 
@@ -86,7 +125,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         }
         recorder.write(&sample)?;
         recorded.count(&sample);
-        bar.set_message(format!("{} images, {} joint states", recorded.images, recorded.joint_states));
+        bar.set_message(recorded.summary());
     }
     bar.finish_and_clear();
     let kept = recorder.finish()?;
@@ -99,13 +138,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if args.json {
         print::json(&recorded)?;
     } else {
-        print::line(format_args!(
-            "{:.1} s, {} images, {} joint states in {}",
-            recorded.seconds,
-            recorded.images,
-            recorded.joint_states,
-            args.out.display()
-        ))?;
+        print::line(format_args!("{:.1} s, {} in {}", recorded.seconds, recorded.summary(), args.out.display()))?;
     }
-    Ok(if recorded.images_lost_by_devices > 0 { Exit::Loss } else { Exit::Done })
+    let losses = recorded.losses();
+    for loss in &losses {
+        log::warn!("{loss}");
+    }
+    Ok(if losses.is_empty() { Exit::Done } else { Exit::Loss })
 }
