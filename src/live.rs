@@ -5,7 +5,7 @@ use crate::scene_hint;
 use crate::session::Session;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::Keyframe;
+use trainer::{Keyframe, Split};
 use viz::{Hub, KeyframePose, Status};
 
 /// The status is told this often.
@@ -65,9 +65,9 @@ impl Live {
         }
     }
 
-    /// Whether a limit was reached or the devices failed.
+    /// Whether a limit was reached, the devices failed, or they ended and left nothing to train on.
     pub(crate) fn is_over(&self) -> bool {
-        self.session.is_over() || self.feed.broke_off()
+        self.session.is_over() || self.feed.broke_off() || (self.feed.ended() && !self.can_train())
     }
 
     /// Keyframes held, in order of acceptance.
@@ -188,7 +188,12 @@ impl Live {
     }
 
     fn is_training(&self) -> bool {
-        self.keyframes.len() >= self.start_keyframes || (self.feed.ended() && !self.keyframes.is_empty())
+        self.can_train() && (self.keyframes.len() >= self.start_keyframes || self.feed.ended())
+    }
+
+    /// Several cameras begin with a test keyframe each: their number alone says nothing.
+    fn can_train(&self) -> bool {
+        self.keyframes.iter().any(|keyframe| keyframe.split == Split::Train)
     }
 
     fn state(&self) -> &'static str {

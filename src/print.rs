@@ -23,6 +23,11 @@ pub(crate) fn line(text: impl Display) -> Result<(), StdoutError> {
     })
 }
 
+/// A count with its word: `1 image`, `2 images`.
+pub(crate) fn counted(n: u64, what: &str) -> String {
+    if n == 1 { format!("1 {what}") } else { format!("{n} {what}s") }
+}
+
 /// Prints one JSON object on a line of its own.
 pub(crate) fn json(value: &impl Serialize) -> anyhow::Result<()> {
     Ok(line(serde_json::to_string(value).context("cannot write the result as JSON")?)?)

@@ -200,6 +200,29 @@ fn an_interrupted_run_saves_model_and_recording() {
     assert!(replayed.status.success(), "{}", String::from_utf8_lossy(&replayed.stderr));
 }
 
+/// A replay that leaves nothing to train on ends by itself, and says what was amiss.
+#[test]
+fn a_replay_without_training_keyframes_ends_with_a_reason() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    rig_file(folder);
+    let text = std::fs::read_to_string(folder.join("rig.toml")).expect("a rig file");
+    let once = text.replace(&format!("n_images = {N_IMAGES}"), "n_images = 1");
+    assert_ne!(once, text);
+    std::fs::write(folder.join("once.toml"), once).expect("room on the disk");
+    std::fs::write(folder.join("other.toml"), text.replace("camera.wrist", "camera.front")).expect("room on the disk");
+    events(folder, &["record", "once.toml", "--sim", "--out", "one.mcap", "--json"]);
+    for (rig, reason) in [("rig.toml", "the only keyframe is held out"), ("other.toml", "are of \"wrist\"")] {
+        let output = fieldrig(
+            folder,
+            &["run", rig, "--from", "one.mcap", "--out", &format!("out-{rig}"), "--listen", "127.0.0.1:0"],
+        );
+        let told = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(4), "{told}");
+        assert!(told.contains(reason), "{told}");
+    }
+}
+
 #[test]
 fn a_port_in_use_is_one_clear_sentence() {
     let folder = tempfile::tempdir().expect("a folder");

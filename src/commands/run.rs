@@ -4,7 +4,7 @@ use crate::config::{ArmDriver, Override, Rig};
 use crate::evaluate::Evaluator;
 use crate::exit::{Exit, LackOfEvidence};
 use crate::feed::{Feed, Input};
-use crate::join::Join;
+use crate::join::{Counts, Join, Refusal};
 use crate::live::{Live, LiveOptions, Pace};
 use crate::method::{self, Kind};
 use crate::open::{self, Devices, Opened};
@@ -19,8 +19,8 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
-use trainer::Keyframe;
 use trainer::gpu::Gpu;
+use trainer::{Keyframe, Split};
 use viz::{Hub, Server, ServerConfig};
 
 /// Flags of `run`.
@@ -123,6 +123,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 /// Saves what there is, then tells what went wrong on the way.
 fn save(live: Live, rig: &Rig, kind: Kind, out: &Path, damage: &OnceLock<String>) -> anyhow::Result<Exit> {
     let n_keyframes = live.keyframes().len();
+    let n_train = live.keyframes().iter().filter(|keyframe| keyframe.split == Split::Train).count();
     let live_error_m = worst_position_error_m(live.keyframes());
     run_folder::write_keyframe_list(&out.join("keyframes.txt"), live.keyframes())?;
     let (session, leftover) = live.finish();
@@ -138,14 +139,14 @@ fn save(live: Live, rig: &Rig, kind: Kind, out: &Path, damage: &OnceLock<String>
         device_skipped: counts.device_skipped,
         worst_position_error_m: live_error_m,
     };
-    if n_keyframes > 0 {
+    if n_train > 0 {
         session.finish(out, &particulars)?;
     }
     if let Some(error) = leftover.input_error {
         return Err(anyhow::Error::new(error).context("the devices broke off"));
     }
-    if n_keyframes == 0 {
-        return Err(LackOfEvidence(format!("no keyframe was accepted: {counts}")).into());
+    if n_train == 0 {
+        return Err(LackOfEvidence(nothing_to_train(n_keyframes, counts, rig)).into());
     }
     let losses =
         [leftover.recording_error.map(|error| format!("the recording is cut off: {error}")), damage.get().cloned()];
@@ -202,6 +203,24 @@ impl Args {
     }
 }
 
+/// Why a run ended without a model, as one sentence.
+fn nothing_to_train(n_keyframes: usize, counts: &Counts, rig: &Rig) -> String {
+    let quoted = |names: Vec<&str>| names.iter().map(|name| format!("{name:?}")).collect::<Vec<_>>().join(", ");
+    let expected = quoted(rig.cameras.iter().map(|camera| &*camera.name).collect());
+    let unknown = quoted(counts.unknown_cameras.iter().map(|name| &**name).collect());
+    let n_unknown = counts.refused.get(&Refusal::UnknownCamera).copied().unwrap_or_default();
+    match (n_keyframes, counts.accepted) {
+        (1, _) => format!("nothing to train on: the only keyframe is held out for testing ({counts})"),
+        (2.., _) => format!("nothing to train on: all {n_keyframes} keyframes are held out ({counts})"),
+        (0, 1..) => format!("the run ended before the trainer took its first keyframe ({counts})"),
+        (0, 0) if counts.images == 0 => format!("no image came: the rig file names the cameras {expected}"),
+        (0, 0) if n_unknown == counts.images => {
+            format!("no image of the cameras in the rig file ({expected}): all {n_unknown} are of {unknown}")
+        }
+        (0, 0) => format!("no image became a keyframe: {counts}"),
+    }
+}
+
 /// How far off the worst pose is, where a simulator tells the true ones.
 fn worst_position_error_m(keyframes: &[Arc<Keyframe>]) -> Option<f64> {
     let error_m = |keyframe: &Arc<Keyframe>| {
@@ -214,4 +233,32 @@ fn worst_position_error_m(keyframes: &[Arc<Keyframe>]) -> Option<f64> {
 /// What people at the page should know.
 fn notes(gpu: &Gpu) -> Vec<String> {
     if gpu.is_software() { vec!["no GPU: kernels run on the CPU, slowly".to_owned()] } else { Vec::new() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_without_a_model_says_why() {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
+        let rig = Rig::load(&path, &[]).expect("a rig");
+        let counts = |images, accepted, refused: &[(Refusal, u64)]| Counts {
+            images,
+            accepted,
+            refused: refused.iter().copied().collect(),
+            unknown_cameras: ["front".into()].into(),
+            ..Counts::default()
+        };
+        for (n_keyframes, counts, expected) in [
+            (1, counts(1, 1, &[]), "the only keyframe is held out for testing (1 keyframe of 1 image)"),
+            (0, counts(1, 1, &[]), "ended before the trainer took its first keyframe"),
+            (0, counts(0, 0, &[]), "no image came"),
+            (0, counts(7, 0, &[(Refusal::UnknownCamera, 7)]), "(\"wrist\"): all 7 are of \"front\""),
+            (0, counts(7, 0, &[(Refusal::NoPose, 7)]), "0 keyframes of 7 images; 7 no joint readings"),
+        ] {
+            let told = nothing_to_train(n_keyframes, &counts, &rig);
+            assert!(told.contains(expected), "{told}");
+        }
+    }
 }

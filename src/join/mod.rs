@@ -154,6 +154,7 @@ impl Join {
         self.counts.images += u64::from(!image.is_depth());
         let Some(camera) = self.cameras.iter_mut().find(|camera| camera.config.name == image.camera) else {
             if !image.is_depth() {
+                self.counts.unknown_cameras.insert(Arc::clone(&image.camera));
                 self.refuse(&image.camera, image.stamp, Refusal::UnknownCamera, events);
             }
             return;

@@ -1,6 +1,8 @@
 //! Why images did not become keyframes, counted.
 
-use std::collections::BTreeMap;
+use crate::print::counted;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 /// Why an image did not become a keyframe.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -85,6 +87,8 @@ pub(crate) struct Counts {
     pub(crate) base_poses_refused: u64,
     /// Images refused, by reason.
     pub(crate) refused: BTreeMap<Refusal, u64>,
+    /// Cameras that sent images and are not in the rig file.
+    pub(crate) unknown_cameras: BTreeSet<Arc<str>>,
 }
 
 impl Counts {
@@ -95,7 +99,7 @@ impl Counts {
 
 impl std::fmt::Display for Counts {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{} keyframes of {} images", self.accepted, self.images)?;
+        write!(f, "{} of {}", counted(self.accepted, "keyframe"), counted(self.images, "image"))?;
         for (why, n) in &self.refused {
             write!(f, "; {n} {why}")?;
         }
