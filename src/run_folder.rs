@@ -1,20 +1,35 @@
 //! Where the results of a run go, and what its report says.
 
+use crate::exit::BadArgument;
 use anyhow::{Context, ensure};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
-use trainer::Keyframe;
+use trainer::{Keyframe, Method};
 
 /// The files of a saved model: what `checkpoint_sha256` covers, in this order.
 const MODEL_FILES: [&str; 2] = ["model.json", "splats.ply"];
+/// Where a model lies until it is whole.
+const UNFINISHED: &str = "model.part";
 const SECS_PER_DAY: u64 = 86_400;
 
-/// Makes the folder asked for, or `runs/<UTC time>`.
+/// Refuses a folder that holds a model: results of two runs never mix, and none is replaced.
+pub(crate) fn refuse_model(folder: &Path) -> Result<(), BadArgument> {
+    match MODEL_FILES.iter().find(|name| folder.join(name).exists()) {
+        Some(name) => Err(BadArgument(format!(
+            "--out {}: the folder holds a model already ({name}), name another one",
+            folder.display()
+        ))),
+        None => Ok(()),
+    }
+}
+
+/// Makes the folder asked for, or `runs/<UTC time>`; one that holds a model is refused.
 pub(crate) fn make(asked: Option<&Path>) -> anyhow::Result<PathBuf> {
     if let Some(folder) = asked {
+        refuse_model(folder)?;
         std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
         return Ok(folder.to_owned());
     }
@@ -34,6 +49,18 @@ pub(crate) fn make(asked: Option<&Path>) -> anyhow::Result<PathBuf> {
         }
     }
     anyhow::bail!("runs/{name} and ninety-eight more exist already: name a folder with --out")
+}
+
+/// Saves a model beside its place first and moves it there when it is whole.
+pub(crate) fn save_model(method: &mut dyn Method, folder: &Path) -> anyhow::Result<()> {
+    let unfinished = folder.join(UNFINISHED);
+    method.save(&unfinished)?;
+    // The splats come last: a folder that holds them holds the whole model.
+    for name in MODEL_FILES.iter().filter(|name| unfinished.join(name).exists()) {
+        let place = folder.join(name);
+        std::fs::rename(unfinished.join(name), &place).with_context(|| format!("cannot write {}", place.display()))?;
+    }
+    std::fs::remove_dir_all(&unfinished).with_context(|| format!("cannot remove {}", unfinished.display()))
 }
 
 /// Writes a report as readable JSON.
@@ -102,6 +129,15 @@ mod tests {
         assert_eq!(name_from_time(Duration::from_secs(951_782_400)), "20000229-000000");
         assert_eq!(name_from_time(Duration::from_secs(1_795_253_400)), "20261121-093000");
         assert_eq!(name_from_time(Duration::from_secs(4_102_444_799)), "20991231-235959");
+    }
+
+    #[test]
+    fn a_folder_with_a_model_is_refused_and_named() {
+        let folder = tempfile::tempdir().expect("folder");
+        assert_eq!(make(Some(folder.path())).expect("an empty folder"), folder.path());
+        std::fs::write(folder.path().join("model.json"), b"{}").expect("file");
+        let told = make(Some(folder.path())).expect_err("a model").to_string();
+        assert!(told.contains(folder.path().to_str().expect("plain")) && told.contains("model.json"), "{told}");
     }
 
     #[test]

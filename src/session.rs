@@ -214,7 +214,7 @@ impl Session {
         let seconds = self.secs();
         self.bar.finish_and_clear();
         // Saved before it is scored: a second Ctrl-C during the scoring loses nothing.
-        self.method.save(out)?;
+        run_folder::save_model(self.method.as_mut(), out)?;
         let checkpoint_sha256 = run_folder::checkpoint_sha256(out)?;
         std::mem::swap(&mut self.evaluator, &mut self.last_evaluator);
         let per_image = self.score(usize::MAX)?;

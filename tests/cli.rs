@@ -127,6 +127,16 @@ fn arguments_that_make_no_sense_exit_with_2() {
 }
 
 #[test]
+fn a_folder_that_holds_a_model_is_not_overwritten() {
+    let folder = tempfile::tempdir().expect("a folder");
+    std::fs::write(folder.path().join("splats.ply"), "a model").expect("room on the disk");
+    let model = folder.path().to_str().expect("a plain name");
+    assert_refused(&["train", "absent", "--out", model], 2, &[model, "splats.ply"]);
+    assert_refused(&["run", "absent.toml", "--out", model], 2, &[model, "splats.ply"]);
+    assert_eq!(std::fs::read(folder.path().join("splats.ply")).expect("still there"), b"a model");
+}
+
+#[test]
 fn devices_are_told_as_json() {
     let output = fieldrig(&["devices", "--json"]);
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));

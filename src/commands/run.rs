@@ -54,7 +54,7 @@ pub(crate) struct Args {
     /// Address of the page
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:7007")]
     listen: SocketAddr,
-    /// Where the results and the settled rig file go [default: a new folder in runs]
+    /// Where the results and the settled rig file go; a folder that holds a model is refused [default: a new folder in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
     /// Print one JSON object a line
@@ -81,6 +81,9 @@ struct Particulars {
 
 /// Runs until a limit, the end of the devices, or Ctrl-C; saves the model, its keyframes and the settled rig file.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    if let Some(out) = &args.out {
+        run_folder::refuse_model(out)?;
+    }
     let stop = Stop::on_ctrl_c()?;
     let rig = Rig::load(&args.rig_file, &args.overrides())?;
     let kind = Kind::of_rig(&rig)?;

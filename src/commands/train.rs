@@ -32,7 +32,7 @@ pub(crate) struct Args {
     /// Weights of LPIPS for `SqueezeNet` (safetensors) [default: what `FIELDRIG_LPIPS_WEIGHTS` names; none: no LPIPS]
     #[arg(long, value_name = "FILE")]
     lpips_weights: Option<PathBuf>,
-    /// Where the results go [default: a new folder in runs]
+    /// Where the results go; a folder that holds a model is refused [default: a new folder in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
     /// Print one JSON object a line
@@ -57,6 +57,9 @@ struct Particulars<'a> {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let started = Instant::now();
     let limits = args.limits()?;
+    if let Some(out) = &args.out {
+        run_folder::refuse_model(out)?;
+    }
     let stop = Stop::on_ctrl_c()?;
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
     let evaluators = Evaluators { at_marks: evaluator.clone(), most_at_marks: usize::MAX, at_end: evaluator };
