@@ -2,11 +2,11 @@
 
 use crate::config::{Override, Rig};
 use crate::dataset;
-use crate::exit::{BadArgument, LackOfEvidence};
+use crate::exit::LackOfEvidence;
 use crate::holdout::Holdout;
 use crate::join::{Join, JoinEvent, KeyframeList};
 use crate::open::{self, Opened};
-use crate::print;
+use crate::{print, shrink};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -24,9 +24,9 @@ pub(crate) struct DataArgs {
     /// Take exactly the keyframes of a list that an earlier run wrote (keyframes.txt)
     #[arg(long, value_name = "FILE", conflicts_with = "holdout")]
     pub(crate) keyframes: Option<PathBuf>,
-    /// Shrink the images to this share of their width and height
-    #[arg(long, value_name = "SHARE", default_value_t = 1.0)]
-    pub(crate) scale: f64,
+    /// Shrink the images (not their depth) to this share of their width and height, 0.05 to 1 [default: the rig file's, else 1]
+    #[arg(long, value_name = "SHARE", value_parser = shrink::share)]
+    pub(crate) scale: Option<f64>,
 }
 
 /// Keyframes and what to know of them.
@@ -44,9 +44,6 @@ pub(crate) struct Data {
 impl Data {
     /// Reads a folder, or a recording through the join.
     pub(crate) fn load(path: &Path, args: &DataArgs, overrides: &[Override], quiet: bool) -> anyhow::Result<Self> {
-        if !(args.scale > 0.0 && args.scale <= 1.0) {
-            return Err(BadArgument(format!("--scale {}: must be above 0 and at most 1", args.scale)).into());
-        }
         let list = args.keyframes.as_deref().map(KeyframeList::load).transpose()?;
         let is_recording = path.extension().is_some_and(|ending| ending == RECORDING_ENDING);
         let mut data = if is_recording {
@@ -72,7 +69,7 @@ impl Data {
         let folder = drivers::dataset::read(path)?;
         let holdout = args.holdout.as_deref().map(Holdout::from_argument).transpose()?.unwrap_or_default();
         let bar = print::bar(Some(folder.frames.len() as u64), "{bar:30} {pos} of {len} images", quiet);
-        let loaded = dataset::load(&folder, &holdout, args.scale, &|n_done| bar.set_position(n_done as u64));
+        let loaded = dataset::load(&folder, &holdout, args.scale.unwrap_or(1.0), &|n_done| bar.set_position(n_done as u64));
         bar.finish_and_clear();
         let loaded = loaded?;
         for note in &loaded.notes {
@@ -89,7 +86,7 @@ impl Data {
         quiet: bool,
     ) -> anyhow::Result<Self> {
         let mut overrides = overrides.to_vec();
-        overrides.push(Override::new("train.scale", args.scale));
+        overrides.extend(args.scale.map(|scale| Override::new("train.scale", scale)));
         let Opened { rig, mut source, damage } = open::recording(path, None, &overrides)?;
         let mut join = Join::new(&rig)?;
         if let Some(list) = list {

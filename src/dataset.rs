@@ -1,6 +1,7 @@
 //! Photos of a dataset -> keyframes: decoded, undistorted, scaled, split.
 
 use crate::holdout::Holdout;
+use crate::shrink;
 use anyhow::{Context, ensure};
 use drivers::dataset::{Dataset, DatasetFrame, DepthImage};
 use kinematics::{Intrinsics, Undistortion};
@@ -33,7 +34,9 @@ pub(crate) fn load(
     scale_frac: f64,
     on_progress: &(dyn Fn(usize) + Sync),
 ) -> anyhow::Result<Loaded> {
-    ensure!(scale_frac > 0.0 && scale_frac <= 1.0, "--scale {scale_frac}: must be above 0 and at most 1");
+    for frame in &dataset.frames {
+        shrink::lens(&frame.intrinsics, scale_frac).with_context(|| frame.name.clone())?;
+    }
     let names: Vec<&str> = dataset.frames.iter().map(|frame| frame.name.as_str()).collect();
     let splits = holdout.splits(&names).with_context(|| dataset.path.display().to_string())?;
     let n_done = AtomicUsize::new(0);
@@ -121,16 +124,9 @@ fn keyframe(lens: &LensMaps, frame: &DatasetFrame, scale_frac: f64) -> anyhow::R
         })
     });
     let depth = depth.transpose()?;
-    let full_px = frame.intrinsics.size_px;
-    let mut rgba = lens.undistorted_color(images.rgba_srgb).with_context(in_frame)?;
+    let rgba = lens.undistorted_color(images.rgba_srgb).with_context(in_frame)?;
     let scaled = frame.intrinsics.scaled(scale_frac);
-    if scaled.size_px != full_px {
-        rgba = area_mean(&rgba, full_px, scaled.size_px);
-    }
-    // What is partly masked is masked: no pixel mixes in what must not be seen.
-    for alpha in rgba.iter_mut().skip(3).step_by(4) {
-        *alpha = if *alpha == 255 { 255 } else { 0 };
-    }
+    let rgba = shrink::rgba(rgba, frame.intrinsics.size_px, scaled.size_px);
     Ok(Keyframe {
         camera: CAMERA.into(),
         stamp: frame.stamp,
@@ -145,42 +141,6 @@ fn keyframe(lens: &LensMaps, frame: &DatasetFrame, scale_frac: f64) -> anyhow::R
         split: Split::Train,
         truth: None,
     })
-}
-
-/// Shrinks `[height, width, 4]`: each new pixel is the mean over the area it covers, fractions of pixels included.
-fn area_mean(rgba: &[u8], from_px: [u32; 2], to_px: [u32; 2]) -> Vec<u8> {
-    let [from_width, to_width] = [from_px[0] as usize, to_px[0] as usize];
-    let (columns, rows) = (coverage(from_px[0], to_px[0]), coverage(from_px[1], to_px[1]));
-    let mut out = Vec::with_capacity(4 * to_width * rows.len());
-    let mut sums = vec![[0.0_f32; 4]; from_width];
-    for covered_rows in &rows {
-        sums.fill([0.0; 4]);
-        for &(y, share) in covered_rows {
-            let row = rgba[4 * y * from_width..4 * (y + 1) * from_width].as_chunks::<4>().0;
-            for (sum, pixel) in sums.iter_mut().zip(row) {
-                (0..4).for_each(|channel| sum[channel] += share * f32::from(pixel[channel]));
-            }
-        }
-        for covered_columns in &columns {
-            let mean = |channel: usize| covered_columns.iter().map(|&(x, share)| share * sums[x][channel]).sum::<f32>();
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a mean of bytes is a byte")]
-            out.extend((0..4).map(|channel| mean(channel).round() as u8));
-        }
-    }
-    out
-}
-
-/// For each new pixel of a line, the old ones it covers and their shares, which add up to 1.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "positions lie inside the line")]
-fn coverage(from: u32, to: u32) -> Vec<Vec<(usize, f32)>> {
-    let ratio = f64::from(from) / f64::from(to);
-    let covered = |ix: u32| {
-        let (start, end) = (f64::from(ix) * ratio, (f64::from(ix + 1) * ratio).min(f64::from(from)));
-        let overlap = |old: usize| ((old as f64 + 1.0).min(end) - (old as f64).max(start)) / ratio;
-        let olds = start as usize..(end.ceil() as usize).min(from as usize);
-        olds.map(|old| (old, overlap(old) as f32)).filter(|(_, share)| *share > 1e-6).collect()
-    };
-    (0..to).map(covered).collect()
 }
 
 #[cfg(test)]

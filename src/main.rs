@@ -20,6 +20,7 @@ mod print;
 mod run_folder;
 mod scene_hint;
 mod session;
+mod shrink;
 mod stop;
 mod training_args;
 

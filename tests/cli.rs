@@ -119,7 +119,7 @@ fn data_that_is_not_there_or_is_none_is_told() {
 #[test]
 fn arguments_that_make_no_sense_exit_with_2() {
     assert_refused(&["train", "absent", "--seconds", "NaN"], 2, &["--seconds"]);
-    assert_refused(&["train", "absent", "--scale", "0"], 2, &["--scale"]);
+    assert_refused(&["train", "absent", "--scale", "0.04"], 2, &["--scale", "0.05 to 1"]);
     assert_refused(&["render", "model", "--pose", "1 2 3"], 2, &["16"]);
     assert_refused(&["render", "model", "--pose", "2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"], 2, &["rotation"]);
     assert_refused(&["render", "model"], 2, &["--camera-path"]);

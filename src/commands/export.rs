@@ -1,5 +1,6 @@
 //! `fieldrig export`: models and recordings in the formats of other programs.
 
+use crate::config::Override;
 use crate::exit::{BadArgument, Exit};
 use crate::export::{Written, write_nerfstudio};
 use crate::join::{Join, KeyframeList};
@@ -68,7 +69,7 @@ fn export_ply(model: &Path, out: &Path) -> anyhow::Result<Exit> {
 }
 
 fn export_recording(args: &Args) -> anyhow::Result<Exit> {
-    let mut opened = open::recording(&args.from, None, &[])?;
+    let mut opened = open::recording(&args.from, None, &[Override::new("train.scale", 1.0)])?;
     let mut join = Join::new(&opened.rig)?;
     if let Some(list) = &args.keyframes {
         join = join.taking_only(KeyframeList::load(list)?);

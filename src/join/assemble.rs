@@ -2,37 +2,58 @@
 
 use super::motion::Posed;
 use crate::config;
+use crate::exit::BadArgument;
+use crate::shrink;
 use anyhow::Context;
 use drivers::{Image, TruthImage};
 use kinematics::{Intrinsics, Undistortion};
 use std::sync::Arc;
 use trainer::{DepthMap, Truth};
 
-/// How the images of one camera become pinhole images; computed once.
+/// How the images of one camera become pinhole images of the size for training; computed once.
 pub(super) struct Lens {
+    full: Intrinsics,
     pinhole: Intrinsics,
     undistortion: Option<Undistortion>,
 }
 
 impl Lens {
-    pub(super) fn new(intrinsics: &Intrinsics) -> Self {
+    /// `share` shrinks the width and height of the undistorted images.
+    pub(super) fn new(intrinsics: &Intrinsics, share: f64) -> Result<Self, BadArgument> {
         let undistortion = (!intrinsics.is_pinhole()).then(|| Undistortion::new(intrinsics));
-        Self { pinhole: intrinsics.undistorted(), undistortion }
+        let full = intrinsics.undistorted();
+        Ok(Self { pinhole: shrink::lens(&full, share)?, full, undistortion })
     }
 
-    /// The pinhole camera of the undistorted images.
+    /// The pinhole camera of the undistorted images at the size that the device delivers.
+    pub(super) fn full(&self) -> &Intrinsics {
+        &self.full
+    }
+
+    /// The pinhole camera of the keyframes' images.
     pub(super) fn pinhole(&self) -> &Intrinsics {
         &self.pinhole
     }
 
-    /// `[height, width, 3]` to `[height, width, 4]`, undistorted; alpha tells what was seen.
+    /// Whether the keyframes' images are smaller than the device's.
+    pub(super) fn shrinks(&self) -> bool {
+        self.pinhole.size_px != self.full.size_px
+    }
+
+    /// `[height, width, 3]` to `[height, width, 4]`, undistorted and shrunk; alpha tells what was seen.
     pub(super) fn rgba(&self, rgb: &[u8]) -> anyhow::Result<Arc<[u8]>> {
-        match &self.undistortion {
-            Some(undistortion) => Ok(undistortion.apply_rgb(rgb)?.into()),
-            None => {
-                Ok(rgb.as_chunks::<3>().0.iter().flat_map(|[red, green, blue]| [*red, *green, *blue, 255]).collect())
-            }
+        let opaque = || rgb.as_chunks::<3>().0.iter().flat_map(|[red, green, blue]| [*red, *green, *blue, 255]);
+        if !self.shrinks() {
+            return match &self.undistortion {
+                Some(undistortion) => Ok(undistortion.apply_rgb(rgb)?.into()),
+                None => Ok(opaque().collect()),
+            };
         }
+        let rgba = match &self.undistortion {
+            Some(undistortion) => undistortion.apply_rgb(rgb)?,
+            None => opaque().collect(),
+        };
+        Ok(shrink::rgba(rgba, self.full.size_px, self.pinhole.size_px).into())
     }
 
     fn depth_m(&self, depth_m: Vec<f32>) -> anyhow::Result<Vec<f32>> {
@@ -72,7 +93,9 @@ pub(super) fn rgb(image: &Image, intrinsics: &Intrinsics) -> anyhow::Result<Vec<
 /// What a simulator knows about a keyframe, in the same undistorted pixels.
 pub(super) fn truth(truth: &TruthImage, intrinsics: &Intrinsics, lens: &Lens) -> anyhow::Result<Truth> {
     let rgba_srgb = lens.rgba(&rgb(&truth.image, intrinsics)?).context("the true image")?;
-    Ok(Truth { rgba_srgb, world_from_camera: truth.world_from_camera, psnr_ceiling: truth.psnr_ceiling })
+    // The ceiling is that of the noise at full size; averaging areas takes away much of it.
+    let psnr_ceiling = if lens.shrinks() { None } else { truth.psnr_ceiling };
+    Ok(Truth { rgba_srgb, world_from_camera: truth.world_from_camera, psnr_ceiling })
 }
 
 /// Median of the readings of a depth map, every eighth of every eighth row; `None` when there is none.

@@ -20,6 +20,7 @@ pub(crate) use refusal::{Counts, Refusal};
 
 use crate::config::{self, CameraDriver, Parent, Rig};
 use accept::Acceptance;
+use anyhow::Context;
 use assemble::Lens;
 use drivers::{Image, Sample, TruthImage};
 use kinematics::{HistoryError, Stamp, Transform};
@@ -91,7 +92,7 @@ impl Join {
         let spacing = Spacing { translation_m: join.min_translation_m, rotation_rad: join.min_rotation_rad };
         Ok(Self {
             motion: Motion::new(rig)?,
-            cameras: rig.cameras.iter().map(|camera| CameraState::new(camera, rig, spacing)).collect(),
+            cameras: rig.cameras.iter().map(|camera| CameraState::new(camera, rig, spacing)).collect::<Result<_, _>>()?,
             store: KeyframeStore::new(join.max_keyframes, join.max_bytes, spacing),
             list: None,
             counts: Counts::default(),
@@ -256,22 +257,25 @@ impl Join {
 }
 
 impl CameraState {
-    fn new(camera: &config::Camera, rig: &Rig, spacing: Spacing) -> Self {
+    fn new(camera: &config::Camera, rig: &Rig, spacing: Spacing) -> anyhow::Result<Self> {
+        let named = || format!("camera {:?}", camera.name);
         if camera.readout_micros.is_none() && camera.parent == Parent::Flange {
             log::warn!("camera {:?}: readout_micros is not in the rig file; taken for a global shutter", camera.name);
         }
         if camera.stamp_to_mid_exposure.is_none() && camera.driver != CameraDriver::Sim {
             log::warn!("camera {:?}: stamp_to_mid_exposure_millis is not in the rig file; taken for 0", camera.name);
         }
-        Self {
+        // Depth keeps its size: it has its own lens, and means of distances at edges would lie in the air.
+        let depth_lens = camera.depth.as_ref().map(|depth| Lens::new(&depth.intrinsics, 1.0)).transpose()?;
+        Ok(Self {
             config: camera.clone(),
-            color_lens: Lens::new(&camera.intrinsics),
-            depth_lens: camera.depth.as_ref().map(|depth| Lens::new(&depth.intrinsics)),
+            color_lens: Lens::new(&camera.intrinsics, rig.train.scale).with_context(named)?,
+            depth_lens,
             acceptance: Acceptance::new(&rig.join, camera, spacing),
             waiting: Waiting::new(camera.driver == CameraDriver::Sim && rig.sim.truth),
             n_accepted: 0,
             warned: false,
-        }
+        })
     }
 
     fn mid_exposure(&self, device_stamp: Stamp) -> Stamp {
@@ -292,7 +296,7 @@ impl CameraState {
         if judge {
             let depth_m = depth.as_ref().and_then(assemble::median_depth_m).unwrap_or(default_depth_m);
             let exposure_secs = ripe.image.exposure_secs.or(self.config.exposure_micros.map(|micros| micros * 1e-6));
-            self.acceptance.judge_speed(&ripe.posed, self.color_lens.pinhole(), exposure_secs, depth_m)?;
+            self.acceptance.judge_speed(&ripe.posed, self.color_lens.full(), exposure_secs, depth_m)?;
         }
         let rgb = assemble::rgb(&ripe.image, &self.config.intrinsics).map_err(|e| self.undecodable(&e))?;
         if judge {

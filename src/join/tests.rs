@@ -443,3 +443,28 @@ fn an_hour_leaves_nothing_behind_but_the_store() {
     assert_eq!(join.counts().accepted, 24 + join.counts().evicted);
     assert!(join.cameras[0].waiting.oldest().is_none());
 }
+
+#[test]
+fn shrunk_keyframes_are_area_means_with_the_lens_of_their_size() {
+    let whole = play(&mut join(&rig(&[])), samples(4));
+    let half = play(&mut join(&rig(&[Override::new("train.scale", 0.5)])), samples(4));
+    let stamps = |outcome: &Outcome| outcome.keyframes.iter().map(|keyframe| keyframe.stamp).collect::<Vec<_>>();
+    assert_eq!(stamps(&whole), stamps(&half), "the size of the training images decides nothing");
+    let (full, small) = (&whole.keyframes[1], &half.keyframes[1]);
+    assert_eq!((small.size_px, small.focal_px, small.principal_px), ([32, 24], [30.5, 30.75], [16.0, 12.0]));
+    let red = |keyframe: &Keyframe, x: usize, y: usize| {
+        u32::from(keyframe.rgba_srgb[4 * (y * keyframe.size_px[0] as usize + x)])
+    };
+    for (x, y) in [(0, 0), (17, 9), (31, 23)] {
+        let sum: u32 = [(0, 0), (1, 0), (0, 1), (1, 1)].iter().map(|(i, j)| red(full, 2 * x + i, 2 * y + j)).sum();
+        assert!((4 * red(small, x, y)).abs_diff(sum) <= 2, "pixel {x} {y}");
+    }
+    let depth_px = |keyframe: &Keyframe| keyframe.depth.as_ref().expect("depth").size_px;
+    assert_eq!(depth_px(small), depth_px(full), "depth keeps its size");
+    let truth = small.truth.as_ref().expect("a simulation");
+    assert_eq!((truth.rgba_srgb.len(), truth.psnr_ceiling), (4 * 32 * 24, None));
+    assert!(
+        Join::new(&rig(&[Override::new("train.scale", 0.2)]))
+            .is_err_and(|error| format!("{error:#}").contains("13x10"))
+    );
+}
