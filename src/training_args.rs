@@ -1,23 +1,24 @@
 //! Flags that every training command has; they override keys of the same name in a rig file.
 
-use crate::config::Override;
+use crate::config::{MAX_BYTES, MAX_SPLATS, Override, SEED};
 use crate::method::Kind;
+use clap::value_parser;
 
 /// What to train, and how large it may become.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct TrainingArgs {
-    /// Scene model [default: the rig file's, else splat]
+    /// Scene model: splat [default: the rig file's, else splat]
     #[arg(long, value_name = "METHOD", hide_possible_values = true)]
     pub(crate) method: Option<Kind>,
-    /// Seed of everything random; with --steps, one seed gives one result
-    #[arg(long, value_name = "N")]
-    pub(crate) seed: Option<u32>,
-    /// Most GPU bytes the model may take
-    #[arg(long, value_name = "BYTES")]
+    /// Seed of everything random, 0 to 2^63 - 1; with --steps, one seed gives one result [default: the rig file's, else 1]
+    #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(SEED))]
+    pub(crate) seed: Option<u64>,
+    /// Most GPU bytes the model may take, at least 1000000 [default: the rig file's, else no bound but memory]
+    #[arg(long, value_name = "BYTES", value_parser = value_parser!(u64).range(MAX_BYTES))]
     pub(crate) max_bytes: Option<u64>,
-    /// Most splats
-    #[arg(long, value_name = "N")]
-    pub(crate) max_splats: Option<u32>,
+    /// Most splats, 1 to 100000000 [default: the rig file's, else 400000]
+    #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(MAX_SPLATS))]
+    pub(crate) max_splats: Option<u64>,
 }
 
 impl TrainingArgs {
@@ -28,14 +29,13 @@ impl TrainingArgs {
             overrides.push(Override::new("train.method", method.name()));
         }
         if let Some(seed) = self.seed {
-            overrides.push(Override::new("train.seed", i64::from(seed)));
+            overrides.push(Override::new("train.seed", seed.cast_signed()));
         }
         if let Some(bytes) = self.max_bytes {
-            // TOML has no larger integers, and no GPU that many bytes.
-            overrides.push(Override::new("train.max_bytes", i64::try_from(bytes).unwrap_or(i64::MAX)));
+            overrides.push(Override::new("train.max_bytes", bytes.cast_signed()));
         }
         if let Some(n) = self.max_splats {
-            overrides.push(Override::new("train.max_splats", i64::from(n)));
+            overrides.push(Override::new("train.max_splats", n.cast_signed()));
         }
         overrides
     }

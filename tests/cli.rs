@@ -120,6 +120,12 @@ fn data_that_is_not_there_or_is_none_is_told() {
 fn arguments_that_make_no_sense_exit_with_2() {
     assert_refused(&["train", "absent", "--seconds", "NaN"], 2, &["--seconds"]);
     assert_refused(&["train", "absent", "--scale", "0.04"], 2, &["--scale", "0.05 to 1"]);
+    for (flag, value) in
+        [("--max-splats", "0"), ("--max-bytes", "999"), ("--seed", "9223372036854775808"), ("--method", "nerf")]
+    {
+        assert_refused(&["train", "absent", flag, value], 2, &[flag]);
+        assert_refused(&["run", "absent.toml", flag, value], 2, &[flag]);
+    }
     assert_refused(&["render", "model", "--pose", "1 2 3"], 2, &["16"]);
     assert_refused(&["render", "model", "--pose", "2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"], 2, &["rotation"]);
     assert_refused(&["render", "model"], 2, &["--camera-path"]);

@@ -1,5 +1,6 @@
 //! `fieldrig train`: a model of a dataset folder or a recording.
 
+use crate::config::USUAL_SEED;
 use crate::data::{Data, DataArgs};
 use crate::evaluate::Evaluator;
 use crate::exit::{BadArgument, Exit};
@@ -121,8 +122,8 @@ impl Args {
         }
         let usual = SplatOptions::default();
         let options = SplatOptions {
-            seed: self.training.seed.map_or(usual.seed, u64::from),
-            max_splats: self.training.max_splats.unwrap_or(usual.max_splats),
+            seed: self.training.seed.unwrap_or(USUAL_SEED),
+            max_splats: self.training.max_splats.map_or(usual.max_splats, |n| n.try_into().unwrap_or(u32::MAX)),
             max_bytes: self.training.max_bytes,
             n_planned_steps: self.steps.unwrap_or(usual.n_planned_steps),
             ..usual

@@ -12,8 +12,18 @@ mod write;
 pub(crate) use error::ConfigError;
 
 use kinematics::{Intrinsics, Transform};
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+
+/// Most splats, as a key and as a flag.
+pub(crate) const MAX_SPLATS: RangeInclusive<u64> = 1..=100_000_000;
+/// Most bytes of a model, as a key and as a flag.
+pub(crate) const MAX_BYTES: RangeInclusive<u64> = 1_000_000..=1 << 50;
+/// Seeds, as keys and as a flag: TOML has no larger integers.
+pub(crate) const SEED: RangeInclusive<u64> = 0..=i64::MAX.cast_unsigned();
+/// The seed where nothing says one.
+pub(crate) const USUAL_SEED: u64 = 1;
 
 /// A checked rig.
 #[derive(Clone, Debug, PartialEq)]

@@ -2,8 +2,8 @@
 
 use super::section::{Reading, Section};
 use super::{
-    Arm, ArmDriver, Base, BaseDriver, Camera, CameraDriver, CameraSim, ConfigError, Depth, JoinConfig, Measured,
-    Override, Parent, Rig, Sim, Train,
+    Arm, ArmDriver, Base, BaseDriver, Camera, CameraDriver, CameraSim, ConfigError, Depth, JoinConfig, MAX_BYTES,
+    MAX_SPLATS, Measured, Override, Parent, Rig, SEED, Sim, Train, USUAL_SEED,
 };
 use kinematics::{Chain, Intrinsics, Lens, Transform};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
@@ -26,7 +26,7 @@ pub(super) const CAMERA_DRIVERS: [(&str, CameraDriver); 4] = [
 ];
 pub(super) const PARENTS: [(&str, Parent); 3] =
     [("flange", Parent::Flange), ("base", Parent::Base), ("world", Parent::World)];
-const METHODS: [(&str, &str); 3] = [("splat", "splat"), ("nerf", "nerf"), ("tsdf", "tsdf")];
+const METHODS: [(&str, &str); 1] = [("splat", "splat")];
 /// Poses and lens coefficients beyond this are slips of the pen.
 const FAR: f64 = 1e4;
 /// A quaternion this close to length one is taken as it is, so that a settled file gives the same bits again.
@@ -303,9 +303,9 @@ fn join(mut keys: Section<'_>) -> JoinConfig {
 fn train(mut keys: Section<'_>) -> Train {
     let train = Train {
         method: keys.choice("method", &METHODS).unwrap_or("splat").to_owned(),
-        max_splats: keys.whole("max_splats", 1..=100_000_000),
-        max_bytes: keys.whole("max_bytes", 1_000_000..=1 << 50),
-        seed: keys.whole("seed", 0..=i64::MAX.cast_unsigned()).unwrap_or(1),
+        max_splats: keys.whole("max_splats", MAX_SPLATS),
+        max_bytes: keys.whole("max_bytes", MAX_BYTES),
+        seed: keys.whole("seed", SEED).unwrap_or(USUAL_SEED),
         sh_degree: keys.whole("sh_degree", 0..=3).map_or(3, small),
         scale: keys.number("scale", 0.05..=1.0).unwrap_or(1.0),
     };
@@ -316,7 +316,7 @@ fn train(mut keys: Section<'_>) -> Train {
 fn sim(mut keys: Section<'_>) -> Sim {
     let sim = Sim {
         scene: keys.text("scene").unwrap_or_else(|| "static-arm".to_owned()),
-        seed: keys.whole("seed", 0..=i64::MAX.cast_unsigned()).unwrap_or(1),
+        seed: keys.whole("seed", SEED).unwrap_or(USUAL_SEED),
         ideal: keys.flag("ideal").unwrap_or(false),
         lockstep: keys.flag("lockstep").unwrap_or(false),
         speed: keys.number("speed", 0.01..=2.0).unwrap_or(1.0),
