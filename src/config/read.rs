@@ -215,7 +215,13 @@ fn intrinsics(keys: &mut Section<'_>, size_px: [u32; 2], rectified: bool) -> Opt
     let name = keys.choice("lens", &LENSES).unwrap_or("pinhole");
     let distortion = keys.number_list("distortion").unwrap_or_default();
     let lens = match (name, &distortion[..]) {
-        ("pinhole", _) => Some(Lens::Pinhole),
+        // Drivers print a pinhole as five zeros.
+        ("pinhole", coefficients) if coefficients.iter().all(|k| *k == 0.0) => Some(Lens::Pinhole),
+        ("pinhole", _) => keys.wrong(
+            "distortion",
+            &Value::from(distortion.clone()),
+            "none with lens = \"pinhole\"; set lens to brown_conrady or kannala_brandt",
+        ),
         ("brown_conrady", [k1, k2, p1, p2, k3]) => Some(Lens::BrownConrady([*k1, *k2, *p1, *p2, *k3])),
         ("kannala_brandt", [k1, k2, k3, k4]) => Some(Lens::KannalaBrandt([*k1, *k2, *k3, *k4])),
         _ => keys.wrong(

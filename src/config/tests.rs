@@ -283,3 +283,15 @@ fn the_rig_files_that_come_along_are_good_and_settle() {
     }
     assert!(n_rigs >= 3, "{n_rigs} rig files");
 }
+
+#[test]
+fn a_pinhole_with_coefficients_is_refused_and_one_with_zeros_is_not() {
+    let pinhole = RIG.replace("brown_conrady", "pinhole");
+    assert!(parse(&pinhole, &[]).is_ok());
+    let bent = pinhole.replacen("[0, 0, 0, 0, 0]", "[0.1, 0, 0, 0, 0]", 1);
+    let message = parse(&bent, &[]).expect_err("a bent pinhole").to_string();
+    assert!(
+        message.contains("camera.wrist.intrinsics.distortion") && message.contains("lens = \"pinhole\""),
+        "{message}"
+    );
+}
