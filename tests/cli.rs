@@ -126,6 +126,9 @@ fn arguments_that_make_no_sense_exit_with_2() {
         assert_refused(&["train", "absent", flag, value], 2, &[flag]);
         assert_refused(&["run", "absent.toml", flag, value], 2, &[flag]);
     }
+    for (flag, value) in [("--splats", "0"), ("--splats", "100000000000"), ("--repeats", "0"), ("--size", "0x9")] {
+        assert_refused(&["bench", "kernels", flag, value], 2, &[flag]);
+    }
     assert_refused(&["render", "model", "--pose", "1 2 3"], 2, &["16"]);
     assert_refused(&["render", "model", "--pose", "2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"], 2, &["rotation"]);
     assert_refused(&["render", "model"], 2, &["--camera-path"]);

@@ -9,6 +9,25 @@ use trainer::splat::arrays::SplatArrays;
 use trainer::splat::bench::{Repeats, time_kernels};
 use trainer::splat::cloud::{load_cloud_npz, synthetic_cloud};
 
+/// More splats than any rig file may ask for.
+const MOST_SPLATS: i64 = 100_000_000;
+
+/// What is measured where no flag says.
+struct Usual {
+    size: &'static [Size],
+    splats: &'static [u32],
+    repeats: u32,
+}
+
+/// On a GPU.
+const USUAL: Usual = Usual {
+    size: &[Size([1024, 1024]), Size([1280, 720]), Size([1920, 1080])],
+    splats: &[100_000, 300_000, 1_000_000, 3_000_000],
+    repeats: 30,
+};
+/// On the CPU, which takes seconds a step for what a GPU does in a millisecond, and binds smaller buffers.
+const USUAL_ON_CPU: Usual = Usual { size: &[Size([320, 240])], splats: &[10_000, 30_000], repeats: 3 };
+
 /// What to measure.
 #[derive(Debug, Parser)]
 pub(crate) struct Args {
@@ -27,15 +46,16 @@ struct KernelArgs {
     /// Take the cloud from a file of arrays `means`, `quats`, `log_scales`, `opacities_logit` and `sh`, in place of our own
     #[arg(long, value_name = "FILE.npz")]
     cloud: Option<PathBuf>,
-    /// Image sizes, `WIDTHxHEIGHT`, separated by commas
-    #[arg(long, value_delimiter = ',', default_value = "1024x1024,1280x720,1920x1080", value_parser = parse_size)]
+    /// Image sizes, `WIDTHxHEIGHT`, separated by commas [default: 1024x1024,1280x720,1920x1080; without a GPU 320x240]
+    #[arg(long, value_delimiter = ',', value_parser = parse_size)]
     size: Vec<Size>,
-    /// Numbers of splats, separated by commas (with --cloud: the file's)
-    #[arg(long, value_delimiter = ',', default_value = "100000,300000,1000000,3000000")]
-    splats: Vec<usize>,
-    /// Pictures and steps timed; the median counts
-    #[arg(long, default_value_t = 30)]
-    repeats: usize,
+    /// Numbers of splats, 1 to 100000000, separated by commas; with --cloud the file's
+    /// [default: 100000,300000,1000000,3000000; without a GPU 10000,30000]
+    #[arg(long, value_delimiter = ',', conflicts_with = "cloud", value_parser = clap::value_parser!(u32).range(1..=MOST_SPLATS))]
+    splats: Vec<u32>,
+    /// Pictures and steps timed, 1 to 10000; the median counts [default: 30; without a GPU 3]
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    repeats: Option<u32>,
     /// Print the GPU time of each pass of a step
     #[arg(long)]
     profile: bool,
@@ -77,9 +97,15 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         .as_deref()
         .map(|path| load_cloud_npz(path).with_context(|| format!("cloud {path:?}")))
         .transpose()?;
-    let counts = given.as_ref().map_or_else(|| args.splats.clone(), |cloud| vec![cloud.n_splats()]);
+    let usual = if super::open_gpu()?.is_software() { USUAL_ON_CPU } else { USUAL };
+    let sizes = if args.size.is_empty() { usual.size } else { &args.size };
+    let asked = if args.splats.is_empty() { usual.splats } else { &args.splats };
+    let counts = given
+        .as_ref()
+        .map_or_else(|| asked.iter().map(|n_splats| *n_splats as usize).collect(), |cloud| vec![cloud.n_splats()]);
+    let n_repeats = args.repeats.unwrap_or(usual.repeats) as usize;
     let mut out = std::io::stdout().lock();
-    for (place, Size(size)) in args.size.iter().enumerate() {
+    for (place, Size(size)) in sizes.iter().enumerate() {
         for n_splats in &counts {
             // A fresh device for each row, so that the peak of memory is the row's own.
             let gpu = super::open_gpu()?;
@@ -94,12 +120,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
                     &made
                 }
             };
-            let repeats = Repeats {
-                n_warm_up: args.repeats.div_ceil(3),
-                n_timed: args.repeats.max(1),
-                n_row: (3 * args.repeats).max(1),
-            };
-            let figures = time_kernels(&gpu, cloud, *size, repeats)?;
+            let repeats = Repeats { n_warm_up: n_repeats.div_ceil(3), n_timed: n_repeats, n_row: 3 * n_repeats };
+            let figures = time_kernels(&gpu, cloud, *size, repeats).with_context(|| {
+                format!("{}x{} pixels and {n_splats} splats: try fewer --splats or a smaller --size", size[0], size[1])
+            })?;
             let row = Row {
                 w: size[0],
                 h: size[1],
