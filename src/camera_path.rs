@@ -23,11 +23,15 @@ pub(crate) struct CameraPath {
     pub(crate) size_px: Option<[u32; 2]>,
 }
 
+/// The one type of camera of a path that is drawn.
+const PERSPECTIVE: &str = "perspective";
+
 /// As nerfstudio writes it.
 #[derive(Debug, Deserialize)]
 struct PathFile {
     render_height: Option<u32>,
     render_width: Option<u32>,
+    camera_type: Option<String>,
     camera_path: Vec<PathStand>,
 }
 
@@ -43,7 +47,7 @@ impl CameraPath {
     /// Reads a nerfstudio camera path; its cameras are turned to ours.
     pub(crate) fn load(path: &Path) -> anyhow::Result<Self> {
         let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
-        Self::parse(&text).with_context(|| format!("{} is no nerfstudio camera path", path.display()))
+        Self::parse(&text).with_context(|| format!("the nerfstudio camera path {}", path.display()))
     }
 
     /// One pose, 16 numbers row major, `world_from_camera` with the axes of [`kinematics::camera`].
@@ -55,6 +59,11 @@ impl CameraPath {
     fn parse(text: &str) -> anyhow::Result<Self> {
         let file: PathFile = serde_json::from_str(text)?;
         ensure!(!file.camera_path.is_empty(), "it has no cameras");
+        let camera_type = file.camera_type.as_deref().unwrap_or(PERSPECTIVE);
+        ensure!(
+            camera_type == PERSPECTIVE,
+            "camera_type is {camera_type:?}, only {PERSPECTIVE:?} is drawn (and all directions, with --equirect)"
+        );
         let stand = |(ix, stand): (usize, &PathStand)| {
             let world_from_opengl = rigid(&stand.camera_to_world).with_context(|| format!("camera {ix}"))?;
             let opengl_from_camera = drivers::dataset::nerfstudio::opengl_from_camera();
@@ -109,6 +118,17 @@ mod tests {
         assert!((ahead_in_world - Point3::new(1.0, 2.0, 2.0)).norm() < 1e-12, "{ahead_in_world}");
         let below_in_world = stand.world_from_camera * Point3::new(0.0, 1.0, 0.0);
         assert!((below_in_world - Point3::new(1.0, 1.0, 3.0)).norm() < 1e-12, "{below_in_world}");
+    }
+
+    #[test]
+    fn only_perspective_cameras_are_drawn() {
+        let of_type = |camera_type: &str| {
+            let text =
+                serde_json::json!({ "camera_type": camera_type, "camera_path": [{ "camera_to_world": IDENTITY }] });
+            CameraPath::parse(&text.to_string())
+        };
+        assert!(of_type("perspective").is_ok());
+        assert!(of_type("fisheye").expect_err("a fisheye").to_string().contains("fisheye"));
     }
 
     #[test]

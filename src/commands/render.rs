@@ -35,7 +35,7 @@ pub(crate) struct Args {
     #[arg(long, conflicts_with = "fov")]
     equirect: bool,
     /// Draw only what lies in a box in the world: x y z of the lowest corner, then of the highest, metres
-    #[arg(long, value_name = "NUMBERS", allow_hyphen_values = true, value_parser = numbers::<6>)]
+    #[arg(long, value_name = "NUMBERS", allow_hyphen_values = true, value_parser = corners)]
     crop: Option<Numbers<6>>,
     /// Write depth too, metres along the camera's z axis (distance with --equirect), as .npy
     #[arg(long)]
@@ -58,6 +58,18 @@ fn numbers<const N: usize>(text: &str) -> Result<Numbers<N>, String> {
         words.map(|word| word.parse().map_err(|_| format!("{word:?} is no number"))).collect::<Result<_, _>>()?;
     let n = values.len();
     <[f64; N]>::try_from(values).map(Numbers).map_err(|_| format!("got {n} numbers, expected {N}"))
+}
+
+/// Two opposite corners of a box, the lowest first.
+fn corners(text: &str) -> Result<Numbers<6>, String> {
+    let corners = numbers::<6>(text)?;
+    let Numbers([x, y, z, to_x, to_y, to_z]) = corners;
+    for (axis, from, to) in [("x", x, to_x), ("y", y, to_y), ("z", z, to_z)] {
+        if !(from.is_finite() && to.is_finite() && from < to) {
+            return Err(format!("{axis} goes from {from} to {to}, must be finite and go up"));
+        }
+    }
+    Ok(corners)
 }
 
 fn size(text: &str) -> Result<[u32; 2], String> {
@@ -98,7 +110,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     bar.finish_and_clear();
     if !args.json {
-        print::line(format_args!("{} pictures in {}", requests.len(), args.out.display()))?;
+        let n_pictures = print::counted(requests.len() as u64, "picture");
+        print::line(format_args!("{n_pictures} in {}", args.out.display()))?;
     }
     Ok(Exit::Done)
 }
@@ -168,6 +181,10 @@ mod tests {
         assert_eq!(numbers::<3>("1, -2 3.5").map(|Numbers(values)| values), Ok([1.0, -2.0, 3.5]));
         assert!(numbers::<3>("1 2").is_err_and(|error| error.contains("got 2")));
         assert!(numbers::<1>("one").is_err());
+        assert!(corners("0 0 0 1 1 1").is_ok());
+        for wrong in ["0 0 1 1 1 0", "0 0 0 1 1 nan", "0 0 0 1 0 1", "-inf 0 0 1 1 1", "0 0 0"] {
+            assert!(corners(wrong).is_err(), "{wrong}");
+        }
     }
 
     #[test]
