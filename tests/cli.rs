@@ -129,6 +129,9 @@ fn arguments_that_make_no_sense_exit_with_2() {
     for (flag, value) in [("--splats", "0"), ("--splats", "100000000000"), ("--repeats", "0"), ("--size", "0x9")] {
         assert_refused(&["bench", "kernels", flag, value], 2, &[flag]);
     }
+    for metres in ["0", "nan", "-1"] {
+        assert_refused(&["metrics", "a.png", "b.png", &format!("--metres-per-count={metres}")], 2, &["above 0"]);
+    }
     assert_refused(&["render", "model", "--pose", "1 2 3"], 2, &["16"]);
     assert_refused(&["render", "model", "--pose", "2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"], 2, &["rotation"]);
     assert_refused(&["render", "model"], 2, &["--camera-path"]);

@@ -26,8 +26,13 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE")]
     lpips_weights: Option<PathBuf>,
     /// Metres per count, when both pictures are 16-bit depth
-    #[arg(long, value_name = "METRES", default_value_t = 0.001)]
+    #[arg(long, value_name = "METRES", default_value_t = 0.001, value_parser = positive)]
     metres_per_count: f64,
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    let number = text.parse::<f64>().ok().filter(|number| number.is_finite() && *number > 0.0);
+    number.ok_or_else(|| "must be a number above 0".to_owned())
 }
 
 /// What is printed; `None` is not known.
