@@ -93,6 +93,11 @@ fn wrong_input_gets_one_sentence_and_no_output() {
     let cases = [
         (&["--tip", "wrist"][..], fine, r#"link "wrist" is not in the URDF"#),
         (&["--tip", "link1", "--base", "link2"], fine, r#"link "link1" is not below link "link2""#),
+        (
+            &["--tip", "link0", "--base", "link2"],
+            fine,
+            r#"link "link0" is not below link "link2"; no link is above it"#,
+        ),
         (&["--tip", "link2"], fine, r#"joint "joint2" moves "link2" but is not among the joints given"#),
         (
             &["--tip", "link1"],

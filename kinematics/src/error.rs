@@ -115,7 +115,7 @@ pub enum Error {
         links: Vec<String>,
     },
     /// The base is not above the tip.
-    #[error("link {tip:?} is not below link {base:?}; above it are {}", .ancestors.join(", "))]
+    #[error("link {tip:?} is not below link {base:?}; {}", above(.ancestors))]
     NotBelow {
         /// The tip asked for.
         tip: String,
@@ -180,4 +180,12 @@ pub enum Error {
         /// Its value.
         value: f64,
     },
+}
+
+fn above(ancestors: &[String]) -> String {
+    if ancestors.is_empty() {
+        "no link is above it".to_owned()
+    } else {
+        format!("above it are {}", ancestors.join(", "))
+    }
 }
