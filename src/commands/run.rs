@@ -2,7 +2,7 @@
 
 use crate::config::{ArmDriver, Override, Rig};
 use crate::evaluate::Evaluator;
-use crate::exit::{Exit, LackOfEvidence};
+use crate::exit::{BadArgument, Exit, LackOfEvidence};
 use crate::feed::{Feed, Input};
 use crate::join::{Counts, Join, Refusal};
 use crate::live::{Live, LiveOptions, Pace};
@@ -32,7 +32,7 @@ pub(crate) struct Args {
     #[arg(long, conflicts_with = "from")]
     sim: bool,
     /// Wait with the simulation for the trainer, so that a seed gives one result; else it runs in real time
-    #[arg(long, requires = "sim")]
+    #[arg(long, requires = "sim", conflicts_with = "from")]
     lockstep: bool,
     /// Replay a recording instead of live devices
     #[arg(long, value_name = "RECORDING")]
@@ -46,13 +46,13 @@ pub(crate) struct Args {
     /// Stop after N optimiser steps
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
-    /// With a lockstep simulation or a recording: steps between two keyframes
-    #[arg(long, value_name = "N", default_value_t = 10)]
-    steps_per_keyframe: u64,
+    /// With a lockstep simulation or a recording only: steps between two keyframes [default: 10]
+    #[arg(long, value_name = "N")]
+    steps_per_keyframe: Option<u64>,
     #[command(flatten)]
     training: TrainingArgs,
-    /// Address of the page
-    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:7007")]
+    /// Address of the page, as numbers
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:7007", value_parser = address)]
     listen: SocketAddr,
     /// Where the results and the settled rig file go; a folder that holds a model is refused [default: a new folder in runs]
     #[arg(long, value_name = "FOLDER")]
@@ -62,6 +62,12 @@ pub(crate) struct Args {
     json: bool,
 }
 
+fn address(text: &str) -> Result<SocketAddr, String> {
+    text.parse().map_err(|_| "expected an address and a port, such as 127.0.0.1:7007".to_owned())
+}
+
+/// Steps between two keyframes where no flag says.
+const USUAL_STEPS_PER_KEYFRAME: u64 = 10;
 /// People look on while a mark is scored: it must not take long.
 const MOST_SCORED_AT_MARKS: usize = 12;
 
@@ -87,6 +93,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let stop = Stop::on_ctrl_c()?;
     let rig = Rig::load(&args.rig_file, &args.overrides())?;
     let kind = Kind::of_rig(&rig)?;
+    let pace = args.pace(&rig)?;
     let hub = Hub::new();
     let server = Server::start(ServerConfig { listen: args.listen }, hub.clone())?;
     args.tell_address(&server.url())?;
@@ -105,12 +112,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     };
     let limits = Limits { seconds: args.seconds, steps: args.steps };
     let session = Session::new(gpu, method, evaluators, limits, args.json);
-    let options = LiveOptions {
-        pace: args.pace(&rig),
-        method_name: kind.name(),
-        start_keyframes: rig.join.start_keyframes,
-        notes,
-    };
+    let options = LiveOptions { pace, method_name: kind.name(), start_keyframes: rig.join.start_keyframes, notes };
 
     let mut live = Live::new(session, feed, hub, options);
     while !stop.asked() && !live.is_over() {
@@ -196,12 +198,18 @@ impl Args {
     }
 
     /// A recording has no clock of its own, a lockstep simulation waits; everything else goes on without us.
-    fn pace(&self, rig: &Rig) -> Pace {
-        let simulated = rig.arm.driver == ArmDriver::Sim;
+    fn pace(&self, rig: &Rig) -> Result<Pace, BadArgument> {
+        let simulated = self.sim || rig.arm.driver == ArmDriver::Sim;
         if self.from.is_some() || (simulated && rig.sim.lockstep) {
-            Pace::Lockstep { steps_per_keyframe: self.steps_per_keyframe }
-        } else {
-            Pace::RealTime
+            let steps_per_keyframe = self.steps_per_keyframe.unwrap_or(USUAL_STEPS_PER_KEYFRAME);
+            return Ok(Pace::Lockstep { steps_per_keyframe });
+        }
+        match self.steps_per_keyframe {
+            Some(_) => Err(BadArgument(
+                "--steps-per-keyframe: this run is in real time and takes keyframes as they come, it needs --lockstep or --from"
+                    .into(),
+            )),
+            None => Ok(Pace::RealTime),
         }
     }
 }
