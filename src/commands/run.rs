@@ -122,11 +122,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         live.publish()?;
     }
     stop.ask();
-    save(live, &rig, kind, &out, &damage)
+    save(live, args, &rig, &out, &damage)
 }
 
 /// Saves what there is, then tells what went wrong on the way.
-fn save(live: Live, rig: &Rig, kind: Kind, out: &Path, damage: &OnceLock<String>) -> anyhow::Result<Exit> {
+fn save(live: Live, args: &Args, rig: &Rig, out: &Path, damage: &OnceLock<String>) -> anyhow::Result<Exit> {
     let n_keyframes = live.keyframes().len();
     let n_train = live.keyframes().iter().filter(|keyframe| keyframe.split == Split::Train).count();
     let live_error_m = worst_position_error_m(live.keyframes());
@@ -136,7 +136,7 @@ fn save(live: Live, rig: &Rig, kind: Kind, out: &Path, damage: &OnceLock<String>
     let counts = leftover.join.counts();
     log::info!("{counts}");
     let particulars = Particulars {
-        method: kind.name(),
+        method: Kind::of_rig(rig)?.name(),
         seed: rig.train.seed,
         keyframes: n_keyframes,
         evicted: counts.evicted,

@@ -42,6 +42,8 @@ pub struct FrameImages {
     pub rgba_srgb: Vec<u8>,
     /// Depth, still distorted.
     pub depth: Option<DepthImage>,
+    /// Why there is no depth though the frame has a file for it.
+    pub depth_error: Option<String>,
 }
 
 /// Decoded depth with its own size.
@@ -54,7 +56,7 @@ pub struct DepthImage {
 }
 
 impl DatasetFrame {
-    /// Decodes the files of this frame.
+    /// Decodes the files of this frame; depth that does not decode costs the depth, not the photo.
     pub fn load(&self) -> Result<FrameImages, Error> {
         let mut rgba = decoded(&self.image_path)?.into_rgba8();
         self.require_size(&self.image_path, [rgba.width(), rgba.height()])?;
@@ -68,8 +70,12 @@ impl DatasetFrame {
                 pixel.0[3] = if keep.0[0] == 0 { 0 } else { pixel.0[3] };
             }
         }
-        let depth = self.depth.as_ref().map(|file| self.load_depth(file)).transpose()?;
-        Ok(FrameImages { rgba_srgb: rgba.into_raw(), depth })
+        let (depth, depth_error) = match self.depth.as_ref().map(|file| self.load_depth(file)) {
+            Some(Err(error)) => (None, Some(error.to_string())),
+            Some(Ok(depth)) => (Some(depth), None),
+            None => (None, None),
+        };
+        Ok(FrameImages { rgba_srgb: rgba.into_raw(), depth, depth_error })
     }
 
     fn load_depth(&self, file: &DepthFile) -> Result<DepthImage, Error> {

@@ -22,6 +22,8 @@ pub struct Dataset {
     pub n_unusable: usize,
     /// What a user should know: one sentence each, with the first names of what was left out.
     pub notes: Vec<String>,
+    /// What is there but broken, so that it is lost to the user: one sentence each.
+    pub losses: Vec<String>,
 }
 
 /// Reads a dataset folder of either kind; `path` may also name a `transforms.json`.
@@ -35,11 +37,16 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
     Err(Error::NotADataset { path: path.to_owned() })
 }
 
+/// Poses beyond this are slips of the pen, metres.
+const FAR_M: f64 = 1e4;
+
 /// What was left out while reading.
 #[derive(Debug, Default)]
 struct LeftOut {
     missing: Vec<String>,
+    /// With the reason, and so below.
     unusable: Vec<(String, String)>,
+    broken: Vec<(String, String)>,
 }
 
 impl LeftOut {
@@ -48,21 +55,31 @@ impl LeftOut {
 
     /// The dataset, once there is something in it.
     fn dataset(self, path: &Path, frames: Vec<DatasetFrame>, mut notes: Vec<String>) -> Result<Dataset, Error> {
-        let (n_missing, n_unusable) = (self.missing.len(), self.unusable.len());
+        let (n_missing, n_unusable) = (self.missing.len(), self.unusable.len() + self.broken.len());
         if frames.is_empty() {
-            let first_reason = self.unusable.first().map(|(name, reason)| format!(" ({name}: {reason})"));
-            let first_reason = first_reason.unwrap_or_default();
+            let first_reason = self.broken.iter().chain(&self.unusable).next();
+            let first_reason = first_reason.map(|(name, reason)| format!(" ({name}: {reason})")).unwrap_or_default();
             return Err(Error::EmptyDataset { path: path.to_owned(), n_missing, n_unusable, first_reason });
         }
         if n_missing > 0 {
-            notes.push(format!("{n_missing} images are not there: {}", first_names(&self.missing)));
+            let (images, are) = plural(n_missing, "image");
+            notes.push(format!("{images} {are} not there: {}", first_names(&self.missing)));
         }
-        if n_unusable > 0 {
-            let named: Vec<_> = self.unusable.iter().map(|(name, reason)| format!("{name} ({reason})")).collect();
-            notes.push(format!("{n_unusable} images cannot be used: {}", first_names(&named)));
-        }
-        Ok(Dataset { path: path.to_owned(), frames, n_missing, n_unusable, notes })
+        notes.extend(cannot_be_used(&self.unusable));
+        let losses = cannot_be_used(&self.broken).into_iter().collect();
+        Ok(Dataset { path: path.to_owned(), frames, n_missing, n_unusable, notes, losses })
     }
+}
+
+fn cannot_be_used(images: &[(String, String)]) -> Option<String> {
+    let named: Vec<_> = images.iter().map(|(name, reason)| format!("{name} ({reason})")).collect();
+    let (n_images, _) = plural(images.len(), "image");
+    (!named.is_empty()).then(|| format!("{n_images} cannot be used: {}", first_names(&named)))
+}
+
+/// `1 image` and `is`, `2 images` and `are`.
+fn plural(n: usize, what: &str) -> (String, &'static str) {
+    if n == 1 { (format!("1 {what}"), "is") } else { (format!("{n} {what}s"), "are") }
 }
 
 /// The first names, and that there are more.

@@ -3,7 +3,7 @@
 //! Their cameras look along -z with y up (OpenGL); poses are turned to ours here and nowhere else.
 
 use super::frame::size_of;
-use super::{Dataset, DatasetFrame, DepthFile, LeftOut};
+use super::{Dataset, DatasetFrame, DepthFile, FAR_M, LeftOut, plural};
 use crate::Error;
 use kinematics::{Intrinsics, Lens, Stamp, Transform, transform};
 use nalgebra::{UnitQuaternion, Vector3};
@@ -19,13 +19,16 @@ const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
 
 /// Reads a folder, or the file itself.
 ///
-/// Frames come in file-name order. Images that are not there or are no images are left out and counted; a pose that is not
-/// finite or not rigid, or a camera model we lack, is an error that names the frame.
+/// Frames come in file-name order. Images that are not there, are no images, or were taken further away than any robot
+/// goes, are left out and counted; a pose that is not finite or not rigid, or a camera model we lack, is an error that names the frame.
 pub fn read(path: &Path) -> Result<Dataset, Error> {
     let file = if path.is_file() { path.to_owned() } else { path.join(FILE_NAME) };
     let folder = file.parent().unwrap_or(Path::new(".")).to_owned();
     let text = std::fs::read_to_string(&file).map_err(|source| Error::Open { path: file.clone(), source })?;
     let wrong = |reason: String| Error::DatasetFile { path: file.clone(), reason };
+    if !text.trim_start().starts_with('{') {
+        return Err(wrong("neither a recording (.mcap) nor a dataset folder nor a transforms.json".to_owned()));
+    }
     let mut document: Document = serde_json::from_str(&nan_as_null(&text)).map_err(|error| wrong(error.to_string()))?;
     document.frames.sort_by(|a, b| a.file_path.cmp(&b.file_path));
     let metres_per_count = document.depth_unit_scale_factor.unwrap_or(DEFAULT_METRES_PER_COUNT);
@@ -46,10 +49,14 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
         let size_px = match size_of(&image_path) {
             Ok(size_px) => size_px,
             Err(error) => {
-                left_out.unusable.push((entry.file_path.clone(), reason_of(&error)));
+                left_out.broken.push((entry.file_path.clone(), reason_of(&error)));
                 continue;
             }
         };
+        if let Some(far_m) = [Some(world_from_camera), depth_pose].into_iter().flatten().find_map(far_m) {
+            left_out.broken.push((entry.file_path.clone(), format!("a pose {far_m:e} m away, at most {FAR_M:e} m")));
+            continue;
+        }
         let camera = entry.camera.or(&document.camera);
         let intrinsics = camera.intrinsics(size_px).map_err(in_frame)?;
         if notes.is_empty() && camera.size_px().is_some_and(|told| told != size_px) {
@@ -72,7 +79,8 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
     }
     let n_lost_depth = document.frames.iter().filter(|entry| entry.lacks_depth(&folder)).count();
     if n_lost_depth > 0 {
-        notes.push(format!("{n_lost_depth} depth images are not there"));
+        let (images, are) = plural(n_lost_depth, "depth image");
+        notes.push(format!("{images} {are} not there"));
     }
     left_out.dataset(&folder, frames, notes)
 }
@@ -140,6 +148,12 @@ fn world_from_camera(matrix: &Matrix) -> Result<Transform, String> {
         .map_err(|rows: Vec<f64>| format!("transform_matrix has {} numbers, must be 4 rows of 4", rows.len()))?;
     let world_from_opengl = transform::from_rows(&rows).map_err(|error| error.to_string())?;
     Ok(world_from_opengl * opengl_from_camera())
+}
+
+/// How far away along an axis a pose lies that is too far.
+fn far_m(pose: Transform) -> Option<f64> {
+    let far_m = pose.translation.vector.amax();
+    (far_m > FAR_M).then_some(far_m)
 }
 
 /// Half a turn about x: theirs looks along -z with y up, ours along z with y down.

@@ -137,7 +137,7 @@ fn masks_and_depth_of_another_size_are_decoded() {
     document["depth_unit_scale_factor"] = json!(0.0002);
     write_transforms(&folder, &document);
     let dataset = read(folder.path()).unwrap();
-    assert_eq!(dataset.notes, ["1 depth images are not there"]);
+    assert_eq!(dataset.notes, ["1 depth image is not there"]);
     let images = dataset.frames[0].load().unwrap();
     let alphas: Vec<u8> = images.rgba_srgb.chunks_exact(4).take(8).map(|pixel| pixel[3]).collect();
     assert_eq!(alphas, [0, 0, 255, 255, 255, 255, 255, 255]);
@@ -158,7 +158,8 @@ fn missing_and_garbage_images_are_left_out_and_counted() {
     write_transforms(&folder, &document);
     let dataset = read(folder.path()).unwrap();
     assert_eq!((dataset.frames.len(), dataset.n_missing, dataset.n_unusable), (2, 1, 1));
-    assert!(dataset.notes[0].contains("none.png") && dataset.notes[1].contains("garbage.jpg"), "{:?}", dataset.notes);
+    assert_eq!(dataset.notes, ["1 image is not there: none.png"]);
+    assert!(dataset.losses[0].starts_with("1 image cannot be used: garbage.jpg ("), "{:?}", dataset.losses);
     for name in ["a.png", "b.png"] {
         std::fs::remove_file(folder.path().join(name)).unwrap();
     }
@@ -176,6 +177,27 @@ fn a_photo_that_breaks_off_fails_by_name() {
     let dataset = read(folder.path()).unwrap();
     let text = dataset.frames[0].load().unwrap_err().to_string();
     assert!(text.contains("a.png") && text.contains("does not decode"), "{text}");
+}
+
+#[test]
+fn a_pose_further_away_than_any_robot_goes_costs_its_frame() {
+    let (folder, mut document) = small_folder();
+    document["frames"][1]["transform_matrix"][2][3] = json!(1e30);
+    write_transforms(&folder, &document);
+    let dataset = read(folder.path()).unwrap();
+    assert_eq!((dataset.frames.len(), dataset.n_unusable), (1, 1));
+    assert_eq!(dataset.losses, ["1 image cannot be used: a.png (a pose 1e30 m away, at most 1e4 m)"]);
+}
+
+#[test]
+fn depth_that_does_not_decode_costs_the_depth_only() {
+    let (folder, mut document) = small_folder();
+    document["frames"][1]["depth_file_path"] = json!("depth.png");
+    std::fs::write(folder.path().join("depth.png"), b"no picture").unwrap();
+    write_transforms(&folder, &document);
+    let images = read(folder.path()).unwrap().frames[0].load().unwrap();
+    assert_eq!((images.rgba_srgb.len(), images.depth), (8 * 6 * 4, None));
+    assert!(images.depth_error.is_some_and(|reason| reason.contains("depth.png")));
 }
 
 #[test]
@@ -200,7 +222,8 @@ fn a_bad_pose_or_camera_names_the_frame() {
     assert!(with("\"fl_x\":5.0,", "").contains("no focal length"));
     assert!(with("\"aabb_scale\":16", "\"depth_unit_scale_factor\":0").contains("must be above 0"));
     assert!(with("\"frames\"", "\"frame\"").contains("missing field `frames`"));
-    assert!(with("{", "").contains("transforms.json"));
+    assert!(with("{", "").contains("neither a recording (.mcap) nor a dataset folder nor a transforms.json"));
+    assert!(with("}", "").contains("transforms.json"));
 }
 
 #[test]
@@ -243,7 +266,7 @@ fn tum_photos_take_the_pose_between_readings_and_the_nearest_depth() {
     let dataset = read(folder.path()).unwrap();
     assert_eq!((dataset.frames.len(), dataset.n_missing, dataset.n_unusable), (3, 1, 1));
     assert!(dataset.notes.iter().any(|note| note.contains("rgb/9.000000.png (no pose within 20 ms)")));
-    assert!(dataset.notes.contains(&"1 photos have no depth image within 20 ms".to_owned()), "{:?}", dataset.notes);
+    assert!(dataset.notes.contains(&"1 photo has no depth image within 20 ms".to_owned()), "{:?}", dataset.notes);
     let second = &dataset.frames[1];
     assert_eq!(second.stamp, Stamp(1_100_000_000));
     // Halfway between two readings; the depth image was taken 10 ms later and 1 cm on.

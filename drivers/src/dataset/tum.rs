@@ -54,7 +54,7 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
             continue;
         };
         let Ok(size_px) = size_of(&image_path) else {
-            left_out.unusable.push((name, "not an image".to_owned()));
+            left_out.broken.push((name, "not an image".to_owned()));
             continue;
         };
         let depth = nearest(&depths, stamp).and_then(|(depth_stamp, depth_name)| {
@@ -67,6 +67,7 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
     }
     let notes = match n_without_depth {
         0 => Vec::new(),
+        1 => vec!["1 photo has no depth image within 20 ms".to_owned()],
         n => vec![format!("{n} photos have no depth image within 20 ms")],
     };
     left_out.dataset(folder, frames, notes)
