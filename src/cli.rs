@@ -11,7 +11,9 @@ use clap::{ArgAction, Parser, Subcommand};
     arg_required_else_help = true,
     max_term_width = 110,
     after_help = "Results go to stdout, log and progress to stderr.\n\
-                  Exit codes: 0 done, 1 failed, 2 bad arguments, 3 done with loss, 4 refused for lack of evidence."
+                  Exit codes: 0 done, 1 failed, 2 bad arguments, 3 done with loss, 4 refused for lack of evidence.\n\
+                  A loss is data that came, or should have come, and is not in the result: images that devices lost or that \
+                  do not decode, recordings cut off. Each is named on stderr and, by train and run, in report.json."
 )]
 pub(crate) struct Cli {
     /// Say more on stderr; twice for everything

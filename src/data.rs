@@ -4,7 +4,7 @@ use crate::config::{Override, Rig};
 use crate::dataset;
 use crate::exit::LackOfEvidence;
 use crate::holdout::Holdout;
-use crate::join::{Join, JoinEvent, KeyframeList};
+use crate::join::{Join, JoinEvent, KeyframeList, Origin};
 use crate::open::{self, Opened};
 use crate::{print, shrink};
 use std::collections::BTreeMap;
@@ -43,18 +43,24 @@ pub(crate) struct Data {
 
 impl Data {
     /// Reads a folder, or a recording through the join.
-    pub(crate) fn load(path: &Path, args: &DataArgs, overrides: &[Override], quiet: bool) -> anyhow::Result<Self> {
+    pub(crate) fn load(
+        path: &Path,
+        args: &DataArgs,
+        overrides: &[Override],
+        quiet: bool,
+    ) -> anyhow::Result<Self> {
         let list = args.keyframes.as_deref().map(KeyframeList::load).transpose()?;
+        let holdout = args.holdout.as_deref().map(Holdout::from_argument).transpose()?;
         let is_recording = path.extension().is_some_and(|ending| ending == RECORDING_ENDING);
         let mut data = if is_recording {
-            Self::from_recording(path, args, list.clone(), overrides, quiet)?
+            Self::from_recording(path, list, overrides.iter().cloned().chain(args.overrides()).collect(), quiet)?
         } else {
-            Self::from_folder(path, args, quiet)?
+            Self::from_folder(path, &holdout.clone().unwrap_or_default(), args.scale.unwrap_or(1.0), list, quiet)?
         };
-        if let Some(list) = &list {
-            data.take_only(list);
+        if let (true, Some(holdout)) = (is_recording, &holdout) {
+            data.hold_out(holdout)?;
         }
-        if !data.keyframes.iter().any(|keyframe| keyframe.split == Split::Train) {
+        if data.of_split(Split::Train).is_empty() {
             return Err(LackOfEvidence(format!("{}: no image to train on", path.display())).into());
         }
         Ok(data)
@@ -65,28 +71,34 @@ impl Data {
         self.keyframes.iter().filter(|keyframe| keyframe.split == split).cloned().collect()
     }
 
-    fn from_folder(path: &Path, args: &DataArgs, quiet: bool) -> anyhow::Result<Self> {
+    fn from_folder(
+        path: &Path,
+        holdout: &Holdout,
+        scale: f64,
+        list: Option<KeyframeList>,
+        quiet: bool,
+    ) -> anyhow::Result<Self> {
         let folder = drivers::dataset::read(path)?;
-        let holdout = args.holdout.as_deref().map(Holdout::from_argument).transpose()?.unwrap_or_default();
         let bar = print::bar(Some(folder.frames.len() as u64), "{bar:30} {pos} of {len} images", quiet);
-        let loaded = dataset::load(&folder, &holdout, args.scale.unwrap_or(1.0), &|n_done| bar.set_position(n_done as u64));
+        let loaded = dataset::load(&folder, holdout, scale, &|n_done| bar.set_position(n_done as u64));
         bar.finish_and_clear();
         let loaded = loaded?;
         for note in &loaded.notes {
             log::warn!("{note}");
         }
-        Ok(Self { keyframes: loaded.keyframes, names: loaded.names, rig: None, losses: Vec::new() })
+        let mut data = Self { keyframes: loaded.keyframes, names: loaded.names, rig: None, losses: loaded.losses };
+        if let Some(list) = list {
+            data.take_only(&list)?;
+        }
+        Ok(data)
     }
 
     fn from_recording(
         path: &Path,
-        args: &DataArgs,
         list: Option<KeyframeList>,
-        overrides: &[Override],
+        overrides: Vec<Override>,
         quiet: bool,
     ) -> anyhow::Result<Self> {
-        let mut overrides = overrides.to_vec();
-        overrides.extend(args.scale.map(|scale| Override::new("train.scale", scale)));
         let Opened { rig, mut source, damage } = open::recording(path, None, &overrides)?;
         let mut join = Join::new(&rig)?;
         if let Some(list) = list {
@@ -112,14 +124,11 @@ impl Data {
         apply(join.finish());
         bar.finish_and_clear();
         log::info!("{}", join.counts());
-        let mut losses = Vec::new();
+        let mut losses = join.counts().losses(Origin::Recording);
         losses.extend(damage.get().cloned());
+        losses.extend(join.check_list()?);
         let names = keyframes.iter().map(|keyframe| name(keyframe)).collect();
-        let mut data = Self { keyframes, names, rig: Some(rig), losses };
-        if let Some(argument) = &args.holdout {
-            data.hold_out(&Holdout::from_argument(argument)?)?;
-        }
-        Ok(data)
+        Ok(Self { keyframes, names, rig: Some(rig), losses })
     }
 
     /// Splits anew, each camera on its own.
@@ -138,29 +147,25 @@ impl Data {
     }
 
     /// Keeps what a list names, as what it names it.
-    fn take_only(&mut self, list: &KeyframeList) {
-        let mut kept = Self {
-            keyframes: Vec::new(),
-            names: Vec::new(),
-            rig: self.rig.take(),
-            losses: std::mem::take(&mut self.losses),
-        };
-        for (mut keyframe, name) in std::mem::take(&mut self.keyframes).into_iter().zip(std::mem::take(&mut self.names))
-        {
+    fn take_only(&mut self, list: &KeyframeList) -> Result<(), LackOfEvidence> {
+        let images = || self.keyframes.iter().map(|keyframe| (&*keyframe.camera, keyframe.stamp));
+        self.losses.extend(list.check_found(images(), images().next())?);
+        let all = std::mem::take(&mut self.keyframes).into_iter().zip(std::mem::take(&mut self.names));
+        for (mut keyframe, name) in all {
             if let Some(split) = list.split_of(&keyframe.camera, keyframe.stamp) {
                 Arc::make_mut(&mut keyframe).split = split;
-                kept.keyframes.push(keyframe);
-                kept.names.push(name);
+                self.keyframes.push(keyframe);
+                self.names.push(name);
             }
         }
-        if kept.keyframes.len() < list.len() {
-            kept.losses.push(format!(
-                "{} of {} listed keyframes are not in the data",
-                list.len() - kept.keyframes.len(),
-                list.len()
-            ));
-        }
-        *self = kept;
+        Ok(())
+    }
+}
+
+impl DataArgs {
+    /// The key of the rig file that a flag stands for.
+    fn overrides(&self) -> Option<Override> {
+        self.scale.map(|scale| Override::new("train.scale", scale))
     }
 }
 

@@ -1,6 +1,7 @@
 //! Photos of a dataset -> keyframes: decoded, undistorted, scaled, split.
 
 use crate::holdout::Holdout;
+use crate::print::counted;
 use crate::shrink;
 use anyhow::{Context, ensure};
 use drivers::dataset::{Dataset, DatasetFrame, DepthImage};
@@ -20,14 +21,17 @@ pub(crate) struct Loaded {
     pub(crate) keyframes: Vec<Arc<Keyframe>>,
     /// Names of the photos, in the same order.
     pub(crate) names: Vec<String>,
-    /// What a user should know: of the dataset, and of the photos that did not decode.
+    /// What a user should know.
     pub(crate) notes: Vec<String>,
+    /// What is there but did not decode.
+    pub(crate) losses: Vec<String>,
 }
 
 /// Decodes all photos on all cores.
 ///
 /// `scale_frac` shrinks the undistorted photos (not their depth) by averaging areas; 1 leaves them as they are.
-/// `on_progress` is told how many photos are done. A photo that does not decode is left out with a note; none at all is an error.
+/// `on_progress` is told how many photos are done. A photo that does not decode is left out and told as a loss; when none is
+/// left, that is an error.
 pub(crate) fn load(
     dataset: &Dataset,
     holdout: &Holdout,
@@ -44,7 +48,10 @@ pub(crate) fn load(
     let load_one = |(lens, frame, split): (&LensMaps, &DatasetFrame, Split)| {
         let keyframe = keyframe(lens, frame, scale_frac);
         on_progress(n_done.fetch_add(1, Ordering::Relaxed) + 1);
-        (frame.name.clone(), keyframe.map(|keyframe| Keyframe { camera: camera.clone(), split, ..keyframe }))
+        (
+            frame.name.clone(),
+            keyframe.map(|(keyframe, depth)| (Keyframe { camera: camera.clone(), split, ..keyframe }, depth)),
+        )
     };
 
     // Photos of one lens follow each other; only their maps are in memory at a time.
@@ -57,21 +64,25 @@ pub(crate) fn load(
         start += run.len();
     }
 
-    let mut loaded = Loaded { keyframes: Vec::new(), names: Vec::new(), notes: dataset.notes.clone() };
-    let mut broken = Vec::new();
-    for (name, keyframe) in results {
-        match keyframe {
-            Ok(keyframe) => {
+    let (notes, losses) = (dataset.notes.clone(), dataset.losses.clone());
+    let mut loaded = Loaded { keyframes: Vec::new(), names: Vec::new(), notes, losses };
+    let (mut broken, mut broken_depth) = (Vec::new(), Vec::new());
+    for (name, result) in results {
+        match result {
+            Ok((keyframe, depth_error)) => {
                 loaded.keyframes.push(Arc::new(keyframe));
                 loaded.names.push(name);
+                broken_depth.extend(depth_error);
             }
             Err(error) => broken.push(format!("{error:#}")),
         }
     }
-    let trained = loaded.keyframes.iter().any(|keyframe| keyframe.split == Split::Train);
-    ensure!(trained, "{}: no photo to train on can be used: {}", dataset.path.display(), broken.join("; "));
-    if !broken.is_empty() {
-        loaded.notes.push(format!("{} images cannot be used: {}", broken.len(), broken.join("; ")));
+    ensure!(!loaded.keyframes.is_empty(), "{}: no photo can be used: {}", dataset.path.display(), broken.join("; "));
+    for (what, errors) in [("image", broken), ("depth image", broken_depth)] {
+        if !errors.is_empty() {
+            let n_lost = counted(errors.len() as u64, what);
+            loaded.losses.push(format!("{n_lost} cannot be used: {}", errors.join("; ")));
+        }
     }
     Ok(loaded)
 }
@@ -110,8 +121,8 @@ impl LensMaps {
     }
 }
 
-/// The keyframe of one photo; its camera and split are filled in by the caller.
-fn keyframe(lens: &LensMaps, frame: &DatasetFrame, scale_frac: f64) -> anyhow::Result<Keyframe> {
+/// The keyframe of one photo, and why its depth is lost; its camera and split are filled in by the caller.
+fn keyframe(lens: &LensMaps, frame: &DatasetFrame, scale_frac: f64) -> anyhow::Result<(Keyframe, Option<String>)> {
     let images = frame.load()?;
     let in_frame = || frame.name.clone();
     let depth = images.depth.as_ref().zip(frame.depth.as_ref()).map(|(depth, file)| {
@@ -127,7 +138,7 @@ fn keyframe(lens: &LensMaps, frame: &DatasetFrame, scale_frac: f64) -> anyhow::R
     let rgba = lens.undistorted_color(images.rgba_srgb).with_context(in_frame)?;
     let scaled = frame.intrinsics.scaled(scale_frac);
     let rgba = shrink::rgba(rgba, frame.intrinsics.size_px, scaled.size_px);
-    Ok(Keyframe {
+    let keyframe = Keyframe {
         camera: CAMERA.into(),
         stamp: frame.stamp,
         size_px: scaled.size_px,
@@ -140,7 +151,8 @@ fn keyframe(lens: &LensMaps, frame: &DatasetFrame, scale_frac: f64) -> anyhow::R
         readout_secs: 0.0,
         split: Split::Train,
         truth: None,
-    })
+    };
+    Ok((keyframe, images.depth_error))
 }
 
 #[cfg(test)]

@@ -47,6 +47,14 @@ pub(crate) fn of(error: &anyhow::Error) -> Exit {
     }
 }
 
+/// The exit code of a command that did what it could: each loss of data that was to be kept is told on stderr.
+pub(crate) fn after(losses: &[String]) -> Exit {
+    for loss in losses {
+        log::warn!("lost: {loss}");
+    }
+    if losses.is_empty() { Exit::Done } else { Exit::Loss }
+}
+
 /// Whether whoever read our output went away, as `head` does.
 pub(crate) fn is_broken_pipe(error: &anyhow::Error) -> bool {
     let is_pipe = |io: &std::io::Error| io.kind() == ErrorKind::BrokenPipe;
@@ -63,6 +71,12 @@ mod tests {
         let error = anyhow::Error::new(BadArgument("unknown key".into())).context("rig file");
         assert_eq!(of(&error), Exit::BadArguments);
         assert_eq!(of(&anyhow::anyhow!("disk full")), Exit::Failed);
+    }
+
+    #[test]
+    fn any_loss_is_told_by_the_exit_code() {
+        assert_eq!(after(&[]), Exit::Done);
+        assert_eq!(after(&["1 image did not decode".into()]), Exit::Loss);
     }
 
     #[test]

@@ -236,9 +236,9 @@ impl Session {
             return print::json(&done);
         }
         print::line(format_args!(
-            "{seconds:.1} s, {} steps, {} splats, {:.1} MB: {}",
-            done.steps,
-            done.primitives,
+            "{seconds:.1} s, {}, {}, {:.1} MB: {}",
+            print::counted(done.steps, "step"),
+            print::counted(done.primitives, "splat"),
             done.bytes as f64 / 1e6,
             done.scores
         ))?;

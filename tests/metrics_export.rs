@@ -111,6 +111,8 @@ fn a_model_is_exported_as_ply() {
     assert!(said.contains("nerfstudio is written of a recording"), "{said}");
     let nothing = folder.path().join("nothing");
     let said = complaint(&fieldrig(&["export", text(&nothing), "--to", "ply", "--out", text(&out)]), 2);
+    assert!(said.contains("nothing does not exist"), "{said}");
+    let said = complaint(&fieldrig(&["export", text(folder.path()), "--to", "ply", "--out", text(&out)]), 2);
     assert!(said.contains("neither a folder with splats.ply nor a recording"), "{said}");
     let said = complaint(&fieldrig(&["export", text(&out), "--to", "nerfstudio", "--out", text(&nothing)]), 1);
     assert!(said.contains("is not a recording"), "{said}");

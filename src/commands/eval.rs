@@ -2,7 +2,7 @@
 
 use crate::data::{Data, DataArgs};
 use crate::evaluate::{Evaluator, ImageScores, Scores};
-use crate::exit::{Exit, LackOfEvidence};
+use crate::exit::{self, Exit, LackOfEvidence};
 use crate::{method, print};
 use serde::Serialize;
 use std::path::PathBuf;
@@ -62,8 +62,5 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         }
         print::line(format_args!("{:30} {scores}", format!("mean of {}", per_image.len())))?;
     }
-    for loss in &data.losses {
-        log::warn!("{loss}");
-    }
-    Ok(if data.losses.is_empty() { Exit::Done } else { Exit::Loss })
+    Ok(exit::after(&data.losses))
 }

@@ -1,10 +1,11 @@
 //! `fieldrig export`: models and recordings in the formats of other programs.
 
 use crate::config::Override;
-use crate::exit::{BadArgument, Exit};
+use crate::exit::{self, BadArgument, Exit};
 use crate::export::{Written, write_nerfstudio};
-use crate::join::{Join, KeyframeList};
-use crate::{open, print};
+use crate::join::{Join, KeyframeList, Origin};
+use crate::open;
+use crate::print::{self, counted};
 use anyhow::{Context, ensure};
 use std::path::{Path, PathBuf};
 use trainer::ply;
@@ -41,6 +42,7 @@ enum Format {
 /// Writes the model or recording and says what was written; a recording that ends early is a loss.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let is_model = args.from.join(SPLATS).is_file();
+    ensure!(args.from.exists(), BadArgument(format!("{} does not exist", args.from.display())));
     ensure!(is_model || args.from.is_file(), cannot_export(&args.from));
     match (args.to, is_model) {
         (Format::Ply, true) => export_ply(&args.from, &args.out),
@@ -64,7 +66,8 @@ fn wrong_kind(sentence: &str, from: &Path) -> anyhow::Error {
 fn export_ply(model: &Path, out: &Path) -> anyhow::Result<Exit> {
     let splats = ply::read(&model.join(SPLATS))?;
     ply::write(out, &splats)?;
-    print::line(format!("{} splats of colour degree {} -> {}", splats.n_splats(), splats.sh_degree, out.display()))?;
+    let n_splats = counted(splats.n_splats() as u64, "splat");
+    print::line(format!("{n_splats} of colour degree {} -> {}", splats.sh_degree, out.display()))?;
     Ok(Exit::Done)
 }
 
@@ -81,20 +84,22 @@ fn export_recording(args: &Args) -> anyhow::Result<Exit> {
     }
     join.finish();
     bar.finish_and_clear();
+    let unlisted = join.check_list()?;
     let written = write_nerfstudio(&args.out, join.keyframes().cloned())
         .with_context(|| format!("cannot export {}", args.from.display()))?;
     log::info!("{}", join.counts());
     print::line(format!("{} -> {}", sentence(written), args.out.display()))?;
-    let Some(damage) = opened.damage.get() else { return Ok(Exit::Done) };
-    log::warn!("{damage}");
-    Ok(Exit::Loss)
+    let mut losses = join.counts().losses(Origin::Recording);
+    losses.extend(opened.damage.get().cloned());
+    losses.extend(unlisted);
+    Ok(exit::after(&losses))
 }
 
 fn sentence(written: Written) -> String {
     let Written { n_images, n_depth, n_depth_left_out } = written;
-    let left_out = match n_depth_left_out {
+    let left_out = match n_depth_left_out as u64 {
         0 => String::new(),
-        n => format!(", {n} depth images left out: their lens is not that of their photo"),
+        n => format!(", {} left out: their lens is not that of their photo", counted(n, "depth image")),
     };
-    format!("{n_images} photos, {n_depth} of them with depth{left_out}")
+    format!("{}, {n_depth} of them with depth{left_out}", counted(n_images as u64, "photo"))
 }

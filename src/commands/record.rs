@@ -1,7 +1,7 @@
 //! `fieldrig record`: what the devices say, into a file, and nothing else.
 
 use crate::config::{Override, Rig};
-use crate::exit::{Exit, LackOfEvidence};
+use crate::exit::{self, Exit, LackOfEvidence};
 use crate::open::{self, Devices, Opened};
 use crate::print;
 use crate::stop::Stop;
@@ -109,6 +109,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
     let mut first: Option<Stamp> = None;
     let mut input_error = None;
+    let mut losses = Vec::new();
     while !stop.asked() {
         let sample = match source.next_sample() {
             Ok(Some(sample)) => sample,
@@ -123,16 +124,28 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         if args.seconds.is_some_and(|seconds| recorded.seconds > seconds) {
             break;
         }
-        recorder.write(&sample)?;
+        if let Err(error) = recorder.write(&sample) {
+            losses.push(format!("{:#}", anyhow::Error::new(error)));
+            break;
+        }
         recorded.count(&sample);
         bar.set_message(recorded.summary());
     }
     bar.finish_and_clear();
-    let kept = recorder.finish()?;
+    let kept = losses.is_empty().then(|| recorder.finish());
+    let n_kept = match kept {
+        Some(Ok(kept)) => Some(kept.n_samples),
+        Some(Err(error)) => {
+            losses.push(format!("{:#}", anyhow::Error::new(error)));
+            None
+        }
+        None => None,
+    };
     if let Some(error) = input_error {
-        return Err(anyhow::Error::new(error).context(format!("the devices broke off; {}, {kept}", args.out.display())));
+        let kept = format!("the devices broke off; {} keeps what came before", args.out.display());
+        return Err(anyhow::Error::new(error).context(kept));
     }
-    if kept.n_samples == 0 {
+    if n_kept == Some(0) {
         return Err(LackOfEvidence(format!("no sample came, so {} was not written", args.out.display())).into());
     }
     if args.json {
@@ -140,9 +153,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     } else {
         print::line(format_args!("{:.1} s, {} in {}", recorded.seconds, recorded.summary(), args.out.display()))?;
     }
-    let losses = recorded.losses();
-    for loss in &losses {
-        log::warn!("{loss}");
-    }
-    Ok(if losses.is_empty() { Exit::Done } else { Exit::Loss })
+    losses.extend(recorded.losses());
+    Ok(exit::after(&losses))
 }

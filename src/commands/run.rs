@@ -2,9 +2,9 @@
 
 use crate::config::{ArmDriver, Override, Rig};
 use crate::evaluate::Evaluator;
-use crate::exit::{BadArgument, Exit, LackOfEvidence};
+use crate::exit::{self, BadArgument, Exit, LackOfEvidence};
 use crate::feed::{Feed, Input};
-use crate::join::{Counts, Join, Refusal};
+use crate::join::{Counts, Join, Origin, Refusal};
 use crate::live::{Live, LiveOptions, Pace};
 use crate::method::{self, Kind};
 use crate::open::{self, Devices, Opened};
@@ -80,6 +80,7 @@ struct Particulars {
     evicted: u64,
     refused: BTreeMap<&'static str, u64>,
     device_skipped: u64,
+    losses: Vec<String>,
     /// Largest distance of a keyframe's camera from its true place, metres; in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
     worst_position_error_m: Option<f64>,
@@ -135,6 +136,9 @@ fn save(live: Live, args: &Args, rig: &Rig, out: &Path, damage: &OnceLock<String
     let leftover = leftover?;
     let counts = leftover.join.counts();
     log::info!("{counts}");
+    let mut losses = counts.losses(if args.from.is_some() { Origin::Recording } else { Origin::Devices });
+    losses.extend(leftover.recording_error.map(|error| format!("the recording is cut off: {error}")));
+    losses.extend(damage.get().cloned());
     let particulars = Particulars {
         method: Kind::of_rig(rig)?.name(),
         seed: rig.train.seed,
@@ -142,6 +146,7 @@ fn save(live: Live, args: &Args, rig: &Rig, out: &Path, damage: &OnceLock<String
         evicted: counts.evicted,
         refused: counts.refused.iter().map(|(why, n)| (why.name(), *n)).collect(),
         device_skipped: counts.device_skipped,
+        losses,
         worst_position_error_m: live_error_m,
     };
     if n_train > 0 {
@@ -153,12 +158,7 @@ fn save(live: Live, args: &Args, rig: &Rig, out: &Path, damage: &OnceLock<String
     if n_train == 0 {
         return Err(LackOfEvidence(nothing_to_train(n_keyframes, counts, rig)).into());
     }
-    let losses =
-        [leftover.recording_error.map(|error| format!("the recording is cut off: {error}")), damage.get().cloned()];
-    for loss in losses.iter().flatten() {
-        log::warn!("{loss}");
-    }
-    Ok(if losses.iter().any(Option::is_some) { Exit::Loss } else { Exit::Done })
+    Ok(exit::after(&particulars.losses))
 }
 
 impl Args {

@@ -3,7 +3,7 @@
 use crate::config::USUAL_SEED;
 use crate::data::{Data, DataArgs};
 use crate::evaluate::Evaluator;
-use crate::exit::{BadArgument, Exit};
+use crate::exit::{self, BadArgument, Exit};
 use crate::method::{Kind, options};
 use crate::run_folder;
 use crate::session::{Evaluators, Limits, Session};
@@ -86,9 +86,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         session.step(u64::MAX)?;
     }
 
-    for loss in &data.losses {
-        log::warn!("{loss}");
-    }
     session.finish(
         &out,
         &Particulars {
@@ -102,7 +99,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             losses: &data.losses,
         },
     )?;
-    Ok(if data.losses.is_empty() { Exit::Done } else { Exit::Loss })
+    Ok(exit::after(&data.losses))
 }
 
 impl Args {

@@ -107,10 +107,23 @@ fn photos_that_break_off_are_left_out_with_their_names() {
     truncate("03.png");
     let loaded = load_at(folder.path(), 1.0).unwrap();
     assert_eq!((loaded.keyframes.len(), loaded.names.contains(&"03.png".to_owned())), (9, false));
-    assert!(loaded.notes[0].contains("1 images cannot be used") && loaded.notes[0].contains("03.png"));
+    assert!(loaded.losses[0].contains("1 image cannot be used") && loaded.losses[0].contains("03.png"));
     // The others keep the split they had.
     assert_eq!(loaded.keyframes[7].split, Split::Test);
     (0..10).for_each(|ix| truncate(&format!("{ix:02}.png")));
     let text = load_at(folder.path(), 1.0).unwrap_err().to_string();
-    assert!(text.contains("no photo to train on can be used"), "{text}");
+    assert!(text.contains("no photo can be used"), "{text}");
+}
+
+#[test]
+fn broken_depth_is_a_loss_and_the_photo_stays() {
+    let folder = folder_of(3, &json!({}));
+    let path = folder.path().join("transforms.json");
+    let mut document: Value = serde_json::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap();
+    document["frames"][1]["depth_file_path"] = json!("depth.png");
+    std::fs::write(&path, document.to_string()).unwrap();
+    std::fs::write(folder.path().join("depth.png"), b"no picture").unwrap();
+    let loaded = load_at(folder.path(), 1.0).unwrap();
+    assert_eq!((loaded.keyframes.len(), loaded.losses.len()), (3, 1));
+    assert!(loaded.losses[0].starts_with("1 depth image cannot be used") && loaded.losses[0].contains("depth.png"));
 }

@@ -1,8 +1,9 @@
 //! Lists of keyframes: one line each with camera, stamp in nanoseconds, and split.
 
+use crate::exit::LackOfEvidence;
 use anyhow::{Context, bail};
 use kinematics::Stamp;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::Path;
 use std::sync::Arc;
@@ -27,6 +28,30 @@ impl KeyframeList {
     /// How many keyframes are listed.
     pub(crate) fn len(&self) -> usize {
         self.0.len()
+    }
+
+    /// What of the list is not among these cameras and stamps: one sentence, an error when that is all of it.
+    ///
+    /// `there` is one image of the data, listed or not.
+    pub(crate) fn check_found<'a>(
+        &self,
+        found: impl Iterator<Item = (&'a str, Stamp)>,
+        there: Option<(&str, Stamp)>,
+    ) -> Result<Option<String>, LackOfEvidence> {
+        let found: BTreeSet<(&str, i64)> = found.map(|(camera, stamp)| (camera, stamp.0)).collect();
+        let mut lost = self.0.keys().filter(|(camera, stamp)| !found.contains(&(camera.as_str(), *stamp)));
+        let Some((camera, stamp)) = lost.next() else { return Ok(None) };
+        let n_lost = 1 + lost.count();
+        if n_lost < self.len() {
+            return Ok(Some(format!(
+                "{n_lost} of {} listed keyframes cannot be had from the data, the first is {camera} {stamp}",
+                self.len()
+            )));
+        }
+        let there = there.map_or("no image".to_owned(), |(camera, stamp)| format!("{camera} {}", stamp.0));
+        Err(LackOfEvidence(format!(
+            "the keyframe list fits nothing in the data: it names {camera} {stamp}, the data has {there}"
+        )))
     }
 
     /// The split of a listed keyframe.
@@ -78,6 +103,20 @@ pub(crate) fn text_of<'a>(keyframes: impl Iterator<Item = &'a Arc<Keyframe>>) ->
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_is_listed_and_not_there_is_told() {
+        let list = KeyframeList::parse("wrist 17 test\nwrist 18 train\n").expect("a list");
+        let check = |found: &[(&'static str, i64)]| {
+            let found = found.iter().map(|(camera, nanos)| (*camera, Stamp(*nanos)));
+            list.check_found(found, Some(("front", Stamp(5))))
+        };
+        assert_eq!(check(&[("wrist", 17), ("wrist", 18)]).expect("all"), None);
+        let some = check(&[("wrist", 18)]).expect("one").expect("a loss");
+        assert!(some.starts_with("1 of 2 listed") && some.ends_with("wrist 17"), "{some}");
+        let none = check(&[("wrist", 16)]).expect_err("nothing").to_string();
+        assert!(none.contains("wrist 17") && none.contains("the data has front 5"), "{none}");
+    }
 
     #[test]
     fn a_list_is_read_and_mistakes_are_named_with_their_line() {

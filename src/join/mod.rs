@@ -16,9 +16,10 @@ mod tests;
 mod waiting;
 
 pub(crate) use list::{KeyframeList, text_of as keyframe_list};
-pub(crate) use refusal::{Counts, Refusal};
+pub(crate) use refusal::{Counts, Origin, Refusal, lost_by_devices};
 
 use crate::config::{self, CameraDriver, Parent, Rig};
+use crate::exit::LackOfEvidence;
 use accept::Acceptance;
 use anyhow::Context;
 use assemble::Lens;
@@ -37,6 +38,8 @@ pub(crate) struct Join {
     cameras: Vec<CameraState>,
     store: KeyframeStore,
     list: Option<KeyframeList>,
+    /// The first image that was asked about the list.
+    first_seen: Option<(Arc<str>, Stamp)>,
     counts: Counts,
     max_wait_secs: f64,
     default_depth_m: f64,
@@ -92,9 +95,14 @@ impl Join {
         let spacing = Spacing { translation_m: join.min_translation_m, rotation_rad: join.min_rotation_rad };
         Ok(Self {
             motion: Motion::new(rig)?,
-            cameras: rig.cameras.iter().map(|camera| CameraState::new(camera, rig, spacing)).collect::<Result<_, _>>()?,
+            cameras: rig
+                .cameras
+                .iter()
+                .map(|camera| CameraState::new(camera, rig, spacing))
+                .collect::<Result<_, _>>()?,
             store: KeyframeStore::new(join.max_keyframes, join.max_bytes, spacing),
             list: None,
+            first_seen: None,
             counts: Counts::default(),
             max_wait_secs: join.max_wait_millis * 1e-3,
             default_depth_m: join.default_depth_m,
@@ -148,6 +156,13 @@ impl Join {
     /// The keyframes in the store, in the order of their acceptance.
     pub(crate) fn keyframes(&self) -> impl Iterator<Item = &Arc<Keyframe>> {
         self.store.iter()
+    }
+
+    /// What of the list could not be had, as [`KeyframeList::check_found`] tells it.
+    pub(crate) fn check_list(&self) -> Result<Option<String>, LackOfEvidence> {
+        let Some(list) = &self.list else { return Ok(None) };
+        let found = self.keyframes().map(|keyframe| (&*keyframe.camera, keyframe.stamp));
+        list.check_found(found, self.first_seen.as_ref().map(|(camera, stamp)| (&**camera, *stamp)))
     }
 
     fn push_image(&mut self, image: Image, events: &mut Vec<JoinEvent>) {
@@ -229,6 +244,7 @@ impl Join {
     fn decide(&mut self, camera_ix: usize, ripe: Ripe, events: &mut Vec<JoinEvent>) {
         let listed = self.list.as_ref().map(|list| list.split_of(&ripe.image.camera, ripe.stamp));
         let (name, stamp) = (Arc::clone(&ripe.image.camera), ripe.stamp);
+        self.first_seen.get_or_insert_with(|| (Arc::clone(&name), stamp));
         let camera = &mut self.cameras[camera_ix];
         let split = match listed {
             Some(None) => return, // Not asked for, which is no refusal.

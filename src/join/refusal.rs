@@ -91,10 +91,37 @@ pub(crate) struct Counts {
     pub(crate) unknown_cameras: BTreeSet<Arc<str>>,
 }
 
+/// Where samples come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Origin {
+    /// Devices, real or simulated.
+    Devices,
+    /// A recording; what its devices lost was told when it was made.
+    Recording,
+}
+
 impl Counts {
+    /// What was lost of what should have been kept, one sentence each.
+    pub(crate) fn losses(&self, origin: Origin) -> Vec<String> {
+        let mut losses = Vec::new();
+        if origin == Origin::Devices && self.device_skipped > 0 {
+            losses.push(lost_by_devices(self.device_skipped));
+        }
+        if let Some(n_broken) = self.refused.get(&Refusal::Undecodable) {
+            losses.push(format!("{} did not decode", counted(*n_broken, "image")));
+        }
+        losses
+    }
+
     pub(super) fn refuse(&mut self, why: Refusal) {
         *self.refused.entry(why).or_default() += 1;
     }
+}
+
+/// The loss of images before they came here.
+pub(crate) fn lost_by_devices(n_images: u64) -> String {
+    let what = counted(n_images, "image");
+    format!("{what} lost by the devices, or dropped because we were too slow for them")
 }
 
 impl std::fmt::Display for Counts {
@@ -122,6 +149,15 @@ impl std::fmt::Display for Counts {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_devices_lost_is_lost_once() {
+        let mut counts = Counts { device_skipped: 2, ..Counts::default() };
+        counts.refuse(Refusal::Undecodable);
+        counts.refuse(Refusal::NotMoved);
+        assert_eq!(counts.losses(Origin::Devices).len(), 2);
+        assert_eq!(counts.losses(Origin::Recording), ["1 image did not decode"]);
+    }
 
     #[test]
     fn the_summary_tells_what_happened_and_nothing_else() {

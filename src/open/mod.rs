@@ -122,9 +122,9 @@ impl Source for Replay {
         let sample = self.recording.next_sample()?;
         if sample.is_none()
             && let Some(damage) = self.recording.damage()
-            && self.damage.set(damage.to_owned()).is_ok()
         {
-            log::warn!("{damage}");
+            // Told once: at the end, with the other losses.
+            let _ = self.damage.set(damage.to_owned());
         }
         Ok(sample)
     }
