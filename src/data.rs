@@ -18,7 +18,7 @@ const RECORDING_ENDING: &str = "mcap";
 /// Which images of the data are taken, and what for.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct DataArgs {
-    /// Hold out every N-th image for testing, or the images that a file names, one a line [default: 8]
+    /// Hold out every N-th image for testing, or the images that a file names, one a line; with 1, eval scores all [default: 8]
     #[arg(long, value_name = "N|FILE")]
     pub(crate) holdout: Option<String>,
     /// Take exactly the keyframes of a list that an earlier run wrote (keyframes.txt)
@@ -41,11 +41,21 @@ pub(crate) struct Data {
     pub(crate) losses: Vec<String>,
 }
 
+/// What data are for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Purpose {
+    /// Something must be left to train on.
+    Training,
+    /// Test images suffice.
+    Scoring,
+}
+
 impl Data {
     /// Reads a folder, or a recording through the join.
     pub(crate) fn load(
         path: &Path,
         args: &DataArgs,
+        purpose: Purpose,
         overrides: &[Override],
         quiet: bool,
     ) -> anyhow::Result<Self> {
@@ -60,8 +70,13 @@ impl Data {
         if let (true, Some(holdout)) = (is_recording, &holdout) {
             data.hold_out(holdout)?;
         }
-        if data.of_split(Split::Train).is_empty() {
-            return Err(LackOfEvidence(format!("{}: no image to train on", path.display())).into());
+        let (wanted, what) = match purpose {
+            Purpose::Training => (Split::Train, "no image is left to train on"),
+            Purpose::Scoring => (Split::Test, "no test image"),
+        };
+        if data.of_split(wanted).is_empty() {
+            let n_images = print::counted(data.keyframes.len() as u64, "image");
+            return Err(LackOfEvidence(format!("{}: {what} among {n_images}", path.display())).into());
         }
         Ok(data)
     }

@@ -1,13 +1,14 @@
 //! Which photos of a dataset are kept from training, and what for.
 
-use anyhow::{Context, ensure};
+use crate::exit::BadArgument;
+use anyhow::ensure;
 use std::path::Path;
 use trainer::Split;
 
 /// How test photos are chosen.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Holdout {
-    /// Every n-th photo there is, from the first; n is at least 2.
+    /// Every n-th photo there is, from the first; n is at least 1.
     Every(usize),
     /// The photos of these names.
     Named(Vec<String>),
@@ -21,16 +22,19 @@ impl Default for Holdout {
 
 impl Holdout {
     /// From the value of `--holdout`: a number, or a file with one name a line.
-    pub(crate) fn from_argument(argument: &str) -> anyhow::Result<Self> {
-        if let Ok(every) = argument.parse() {
-            ensure!(every >= 2, "--holdout {every}: every {every}. photo leaves none to train on, must be at least 2");
-            return Ok(Self::Every(every));
+    pub(crate) fn from_argument(argument: &str) -> Result<Self, BadArgument> {
+        let wrong = |reason: &str| BadArgument(format!("--holdout {argument}: {reason}"));
+        if let Ok(every) = argument.parse::<i64>() {
+            return usize::try_from(every)
+                .ok()
+                .filter(|every| *every >= 1)
+                .map(Self::Every)
+                .ok_or_else(|| wrong("must be at least 1, or a file that names photos"));
         }
         let text = std::fs::read_to_string(Path::new(argument))
-            .with_context(|| format!("--holdout {argument}: neither a number nor a file that can be read"))?;
+            .map_err(|error| wrong(&format!("neither a whole number nor a file that can be read ({error})")))?;
         let names: Vec<_> = text.lines().map(str::trim).filter(|name| !name.is_empty()).map(str::to_owned).collect();
-        ensure!(!names.is_empty(), "--holdout {argument}: the file names no photo");
-        Ok(Self::Named(names))
+        if names.is_empty() { Err(wrong("the file names no photo")) } else { Ok(Self::Named(names)) }
     }
 
     /// What each photo is for, in the order of `names`.
@@ -38,12 +42,10 @@ impl Holdout {
     /// Selection photos lie halfway between test photos; with named test photos they are every 8th of the others, from the 5th.
     /// A name matches with its folder and extension or without; one that matches nothing is an error.
     pub(crate) fn splits(&self, names: &[&str]) -> anyhow::Result<Vec<Split>> {
-        let splits = match self {
-            Self::Every(every) => (0..names.len()).map(|ix| every_nth(ix, *every)).collect(),
-            Self::Named(test_names) => named(test_names, names)?,
-        };
-        ensure!(splits.contains(&Split::Train), "no photo is left to train on: {} are held out", names.len());
-        Ok(splits)
+        match self {
+            Self::Every(every) => Ok((0..names.len()).map(|ix| every_nth(ix, *every)).collect()),
+            Self::Named(test_names) => named(test_names, names),
+        }
     }
 }
 
@@ -97,13 +99,16 @@ mod tests {
         let named = |test: &[&str]| Holdout::Named(test.iter().map(|name| (*name).to_owned()).collect()).splits(&names);
         assert_eq!(named(&["images/a.jpg", "b.jpg", "c"]).unwrap(), [Test, Test, Test, Train]);
         assert!(named(&["e"]).unwrap_err().to_string().contains("no photo is called \"e\""));
-        assert!(named(&["a", "b", "c", "d"]).unwrap_err().to_string().contains("no photo is left"));
+        assert_eq!(named(&["a", "b", "c", "d"]).unwrap(), [Test; 4], "all may be scored");
     }
 
     #[test]
     fn the_argument_is_a_number_or_a_file() {
         assert_eq!(Holdout::from_argument("10").unwrap(), Holdout::Every(10));
-        assert!(Holdout::from_argument("1").unwrap_err().to_string().contains("at least 2"));
+        assert_eq!(Holdout::from_argument("1").unwrap().splits(&["a", "b"]).unwrap(), [Test, Test]);
+        for wrong in ["0", "-3"] {
+            assert!(Holdout::from_argument(wrong).unwrap_err().to_string().contains("at least 1"), "{wrong}");
+        }
         assert!(Holdout::from_argument("no/such/file").is_err());
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("test.txt");

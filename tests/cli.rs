@@ -129,15 +129,16 @@ fn arguments_that_make_no_sense_exit_with_2() {
     for (flag, value) in [("--splats", "0"), ("--splats", "100000000000"), ("--repeats", "0"), ("--size", "0x9")] {
         assert_refused(&["bench", "kernels", flag, value], 2, &[flag]);
     }
-    for metres in ["0", "nan", "-1"] {
-        assert_refused(&["metrics", "a.png", "b.png", &format!("--metres-per-count={metres}")], 2, &["above 0"]);
-    }
     let folder = tempfile::tempdir().expect("a folder");
     let rig = changed_rig(folder.path(), "seed = 1", "seed = 2");
     assert_refused(&["run", &rig, "--sim", "--steps-per-keyframe", "3"], 2, &["--steps-per-keyframe", "--lockstep"]);
     assert_refused(&["run", "rig.toml", "--lockstep", "--from", "scan.mcap"], 2, &["--from"]);
     for address in ["7105", "localhost:7105"] {
         assert_refused(&["run", "rig.toml", "--sim", "--listen", address], 2, &["127.0.0.1:7007"]);
+    }
+    assert_refused(&["eval", "model", "absent", "--holdout", "0"], 2, &["--holdout 0"]);
+    for metres in ["0", "nan", "-1"] {
+        assert_refused(&["metrics", "a.png", "b.png", &format!("--metres-per-count={metres}")], 2, &["above 0"]);
     }
     assert_refused(&["render", "model", "--pose", "1 2 3"], 2, &["16"]);
     assert_refused(&["render", "model", "--pose", "2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"], 2, &["rotation"]);

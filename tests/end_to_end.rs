@@ -103,7 +103,15 @@ fn scores_a_saved_model_alike(folder: &Path, psnr: f64) {
     let judged = events(folder, &[&["eval", "live", "scan.mcap"][..], &list[..]].concat());
     let again = number(&judged[0], "psnr");
     assert!((again - psnr).abs() < ABS_DB, "eval says {again} dB, run said {psnr} dB");
-    assert!(judged[0]["per_image"].as_array().is_some_and(|images| images.len() >= 2), "{}", judged[0]);
+    let n_tests = judged[0]["per_image"].as_array().expect("scores").len();
+    assert!(n_tests >= 2, "{}", judged[0]);
+
+    let all = fieldrig(folder, &["eval", "live", "scan.mcap", "--holdout", "1", "--json"]);
+    let told = String::from_utf8_lossy(&all.stderr);
+    assert_eq!(all.status.code(), Some(0), "{told}");
+    assert!(told.contains("the model was trained on"), "{told}");
+    let scored: Value = serde_json::from_slice(&all.stdout).expect("JSON");
+    assert!(scored["per_image"].as_array().is_some_and(|images| images.len() > 4 * n_tests), "all are scored");
 }
 
 fn draws_a_saved_model(folder: &Path) {

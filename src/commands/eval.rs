@@ -1,12 +1,14 @@
 //! `fieldrig eval`: how good a saved model is on the test images of some data.
 
-use crate::data::{Data, DataArgs};
+use crate::data::{Data, DataArgs, Purpose};
 use crate::evaluate::{Evaluator, ImageScores, Scores};
-use crate::exit::{self, Exit, LackOfEvidence};
+use crate::exit::{self, Exit};
+use crate::join::KeyframeList;
 use crate::{method, print};
 use serde::Serialize;
-use std::path::PathBuf;
-use trainer::Split;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use trainer::{Keyframe, Split};
 
 /// Flags of `eval`.
 #[derive(Debug, clap::Args)]
@@ -43,15 +45,16 @@ struct Named {
 /// Draws and scores every test image.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
-    let data = Data::load(&args.data, &args.images, &[], args.json)?;
+    let data = Data::load(&args.data, &args.images, Purpose::Scoring, &[], args.json)?;
     let tests = data.of_split(Split::Test);
-    if tests.is_empty() {
-        return Err(LackOfEvidence(format!("{}: no test image", args.data.display())).into());
+    let n_trained_on = n_trained_on(args, &tests, data.rig.is_some());
+    if n_trained_on > 0 {
+        log::warn!("the model was trained on {n_trained_on} of the {} images that are scored", tests.len());
     }
     let mut model = method::load(super::open_gpu()?, &args.model)?;
     let images = evaluator.score_all(model.as_mut(), &tests)?;
     let scores = Scores::mean(&images);
-    let is_test = |keyframe: &trainer::Keyframe| keyframe.split == Split::Test;
+    let is_test = |keyframe: &Keyframe| keyframe.split == Split::Test;
     let names = data.keyframes.iter().zip(data.names).filter(|(keyframe, _)| is_test(keyframe)).map(|(_, name)| name);
     let per_image: Vec<Named> = names.zip(images).map(|(name, scores)| Named { name, scores }).collect();
     if args.json {
@@ -63,4 +66,23 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         print::line(format_args!("{:30} {scores}", format!("mean of {}", per_image.len())))?;
     }
     Ok(exit::after(&data.losses))
+}
+
+/// How many of the images to score the model was trained on, as the list in its folder says; 0 where there is none.
+///
+/// The images of a folder have no names that hold for all folders, so there the list counts only for the one it was made of.
+fn n_trained_on(args: &Args, tests: &[Arc<Keyframe>], is_recording: bool) -> usize {
+    let Ok(list) = KeyframeList::load(&args.model.join("keyframes.txt")) else { return 0 };
+    if !is_recording && trained_folder(&args.model) != args.data.canonicalize().ok() {
+        return 0;
+    }
+    let is_trained = |keyframe: &&Arc<Keyframe>| list.split_of(&keyframe.camera, keyframe.stamp) == Some(Split::Train);
+    tests.iter().filter(is_trained).count()
+}
+
+/// The data that a model was trained on, as its report says.
+fn trained_folder(model: &Path) -> Option<PathBuf> {
+    let report = std::fs::read_to_string(model.join("report.json")).ok()?;
+    let report: serde_json::Value = serde_json::from_str(&report).ok()?;
+    Path::new(report["data"].as_str()?).canonicalize().ok()
 }

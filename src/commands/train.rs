@@ -1,7 +1,7 @@
 //! `fieldrig train`: a model of a dataset folder or a recording.
 
 use crate::config::USUAL_SEED;
-use crate::data::{Data, DataArgs};
+use crate::data::{Data, DataArgs, Purpose};
 use crate::evaluate::Evaluator;
 use crate::exit::{self, BadArgument, Exit};
 use crate::method::{Kind, options};
@@ -64,7 +64,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let stop = Stop::on_ctrl_c()?;
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
     let evaluators = Evaluators { at_marks: evaluator.clone(), most_at_marks: usize::MAX, at_end: evaluator };
-    let data = Data::load(&args.data, &args.images, &args.training.overrides(), args.json)?;
+    let data = Data::load(&args.data, &args.images, Purpose::Training, &args.training.overrides(), args.json)?;
     let gpu = super::open_gpu()?;
     let (kind, options) = args.model(&data)?;
     let seed = options.seed;
