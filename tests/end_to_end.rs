@@ -231,6 +231,23 @@ fn a_replay_without_training_keyframes_ends_with_a_reason() {
     }
 }
 
+/// A disk that fills up is a loss, told with its cause; what was written before can be read.
+#[test]
+fn a_recording_that_finds_no_room_is_a_loss() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    rig_file(folder);
+    let limited = "trap '' XFSZ; ulimit -f 2000; exec \"$0\" record rig.toml --sim --out cut.mcap";
+    let output = Command::new("sh")
+        .args(["-c", limited, env!("CARGO_BIN_EXE_fieldrig")])
+        .current_dir(folder)
+        .output()
+        .expect("sh starts");
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(3), "{told}");
+    assert!(told.contains("lost: cut.mcap holds the first") && told.contains("too large"), "{told}");
+}
+
 #[test]
 fn a_port_in_use_is_one_clear_sentence() {
     let folder = tempfile::tempdir().expect("a folder");

@@ -137,7 +137,8 @@ fn save(live: Live, args: &Args, rig: &Rig, out: &Path, damage: &OnceLock<String
     let counts = leftover.join.counts();
     log::info!("{counts}");
     let mut losses = counts.losses(if args.from.is_some() { Origin::Recording } else { Origin::Devices });
-    losses.extend(leftover.recording_error.map(|error| format!("the recording is cut off: {error}")));
+    let recording_error = leftover.recording_error.map(anyhow::Error::new);
+    losses.extend(recording_error.map(|error| format!("the recording is cut off: {error:#}")));
     losses.extend(damage.get().cloned());
     let particulars = Particulars {
         method: Kind::of_rig(rig)?.name(),
