@@ -4,7 +4,7 @@ use crate::config::{Override, Rig};
 use crate::dataset;
 use crate::exit::LackOfEvidence;
 use crate::holdout::Holdout;
-use crate::join::{Join, JoinEvent, KeyframeList, Origin};
+use crate::join::{Join, JoinEvent, KeyframeList, Use};
 use crate::open::{self, Opened};
 use crate::{print, shrink};
 use std::collections::BTreeMap;
@@ -139,7 +139,7 @@ impl Data {
         apply(join.finish());
         bar.finish_and_clear();
         log::info!("{}", join.counts());
-        let mut losses = join.counts().losses(Origin::Recording);
+        let mut losses = join.counts().losses(Use::Watched);
         losses.extend(damage.get().cloned());
         losses.extend(join.check_list()?);
         let names = keyframes.iter().map(|keyframe| name(keyframe)).collect();

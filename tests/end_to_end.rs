@@ -245,7 +245,7 @@ fn a_recording_that_finds_no_room_is_a_loss() {
         .expect("sh starts");
     let told = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(3), "{told}");
-    assert!(told.contains("lost: cut.mcap holds the first") && told.contains("too large"), "{told}");
+    assert!(told.contains("cut.mcap\", which keeps the first") && told.contains("too large"), "{told}");
 }
 
 #[test]

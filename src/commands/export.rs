@@ -3,7 +3,7 @@
 use crate::config::Override;
 use crate::exit::{self, BadArgument, Exit};
 use crate::export::{Written, write_nerfstudio};
-use crate::join::{Join, KeyframeList, Origin};
+use crate::join::{Join, KeyframeList, Use};
 use crate::open;
 use crate::print::{self, counted};
 use anyhow::{Context, ensure};
@@ -89,7 +89,7 @@ fn export_recording(args: &Args) -> anyhow::Result<Exit> {
         .with_context(|| format!("cannot export {}", args.from.display()))?;
     log::info!("{}", join.counts());
     print::line(format!("{} -> {}", sentence(written), args.out.display()))?;
-    let mut losses = join.counts().losses(Origin::Recording);
+    let mut losses = join.counts().losses(Use::Watched);
     losses.extend(opened.damage.get().cloned());
     losses.extend(unlisted);
     Ok(exit::after(&losses))

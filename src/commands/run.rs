@@ -4,7 +4,7 @@ use crate::config::{ArmDriver, Override, Rig};
 use crate::evaluate::Evaluator;
 use crate::exit::{self, BadArgument, Exit, LackOfEvidence};
 use crate::feed::{Feed, Input};
-use crate::join::{Counts, Join, Origin, Refusal};
+use crate::join::{Counts, Join, Refusal, Use};
 use crate::live::{Live, LiveOptions, Pace};
 use crate::method::{self, Kind};
 use crate::open::{self, Devices, Opened};
@@ -136,7 +136,8 @@ fn save(live: Live, args: &Args, rig: &Rig, out: &Path, damage: &OnceLock<String
     let leftover = leftover?;
     let counts = leftover.join.counts();
     log::info!("{counts}");
-    let mut losses = counts.losses(if args.from.is_some() { Origin::Recording } else { Origin::Devices });
+    let mut losses =
+        counts.losses(if args.record.is_some() && args.from.is_none() { Use::Recorded } else { Use::Watched });
     let recording_error = leftover.recording_error.map(anyhow::Error::new);
     losses.extend(recording_error.map(|error| format!("the recording is cut off: {error:#}")));
     losses.extend(damage.get().cloned());

@@ -16,7 +16,7 @@ mod tests;
 mod waiting;
 
 pub(crate) use list::{KeyframeList, text_of as keyframe_list};
-pub(crate) use refusal::{Counts, Origin, Refusal, lost_by_devices};
+pub(crate) use refusal::{Counts, Refusal, Use};
 
 use crate::config::{self, CameraDriver, Parent, Rig};
 use crate::exit::LackOfEvidence;

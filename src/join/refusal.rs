@@ -91,20 +91,21 @@ pub(crate) struct Counts {
     pub(crate) unknown_cameras: BTreeSet<Arc<str>>,
 }
 
-/// Where samples come from.
+/// What becomes of samples.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Origin {
-    /// Devices, real or simulated.
-    Devices,
-    /// A recording; what its devices lost was told when it was made.
-    Recording,
+pub(crate) enum Use {
+    /// They are recorded: every image counts.
+    Recorded,
+    /// They are looked at: live, an image that comes too fast is replaced by the next; in a replay, what the devices
+    /// lost was told when the recording was made.
+    Watched,
 }
 
 impl Counts {
     /// What was lost of what should have been kept, one sentence each.
-    pub(crate) fn losses(&self, origin: Origin) -> Vec<String> {
+    pub(crate) fn losses(&self, use_: Use) -> Vec<String> {
         let mut losses = Vec::new();
-        if origin == Origin::Devices && self.device_skipped > 0 {
+        if use_ == Use::Recorded && self.device_skipped > 0 {
             losses.push(lost_by_devices(self.device_skipped));
         }
         if let Some(n_broken) = self.refused.get(&Refusal::Undecodable) {
@@ -119,7 +120,7 @@ impl Counts {
 }
 
 /// The loss of images before they came here.
-pub(crate) fn lost_by_devices(n_images: u64) -> String {
+fn lost_by_devices(n_images: u64) -> String {
     let what = counted(n_images, "image");
     format!("{what} lost by the devices, or dropped because we were too slow for them")
 }
@@ -155,8 +156,8 @@ mod tests {
         let mut counts = Counts { device_skipped: 2, ..Counts::default() };
         counts.refuse(Refusal::Undecodable);
         counts.refuse(Refusal::NotMoved);
-        assert_eq!(counts.losses(Origin::Devices).len(), 2);
-        assert_eq!(counts.losses(Origin::Recording), ["1 image did not decode"]);
+        assert_eq!(counts.losses(Use::Recorded).len(), 2);
+        assert_eq!(counts.losses(Use::Watched), ["1 image did not decode"]);
     }
 
     #[test]
