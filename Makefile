@@ -25,7 +25,10 @@ check: deps open-ends ## Format, clippy, documentation, kernels, licences, open 
 	cargo clippy --workspace --exclude sim --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps $(FEATURES)
 	cargo test --workspace $(FEATURES) --lib every_kernel_parses_and_validates
-	@if cargo deny --version >/dev/null 2>&1; then cargo deny check; \
+	@if cargo deny --version >/dev/null 2>&1; then \
+		cargo deny check licenses bans sources || exit 1; \
+		if cargo deny fetch db >/dev/null 2>&1; then cargo deny check advisories; \
+		else echo "cargo deny: advisories skipped, their database is out of reach"; fi; \
 	else echo "cargo deny: skipped, not installed (cargo install --locked cargo-deny)"; fi
 
 deps: cargo packages mujoco ## Install what building and testing need
