@@ -143,7 +143,7 @@ fn share_light(splat: &mut Splat, n: u32) {
     let shared = (1.0 - (1.0 - opacity).powf(1.0 / f64::from(n))).clamp(0.005, 0.9999);
     let choose = |n: u32, k: u32| (0..k).map(|i| f64::from(n - i) / f64::from(i + 1)).product::<f64>();
     let term = |i: u32, k: u32| {
-        let sign = if k % 2 == 0 { 1.0 } else { -1.0 };
+        let sign = if k.is_multiple_of(2) { 1.0 } else { -1.0 };
         sign * choose(i - 1, k) * shared.powf(f64::from(k + 1)) / f64::from(k + 1).sqrt()
     };
     let weight: f64 = (1..=n).flat_map(|i| (0..i).map(move |k| term(i, k))).sum();
