@@ -247,6 +247,7 @@ fn rule() -> Rule {
         log_scale_range: [-30.0, 30.0],
         seed: 0,
         update_all: 1,
-        unused: [0; 2],
+        schedule_start: 0.0,
+        unused: 0,
     }
 }

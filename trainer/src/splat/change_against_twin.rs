@@ -66,12 +66,13 @@ const RULE: Rule = Rule {
     betas: [0.9, 0.99],
     epsilon: EPSILON,
     n_planned_steps: 5.0,
+    schedule_start: 1.0,
     opacity_cost: 1e-3,
     scale_cost: 2e-3,
     log_scale_range: [-3.0, -1.5], // Some of the scene's splats are outside.
     seed: 11,
     update_all: 1,
-    unused: [0; 2],
+    unused: 0,
 };
 
 #[test]

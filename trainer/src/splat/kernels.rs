@@ -257,6 +257,7 @@ mod tests {
                 log_scale_range,
                 seed,
                 update_all,
+                schedule_start,
                 unused
             ]
         );

@@ -152,6 +152,26 @@ fn learns_without_depth_from_a_random_start() {
     assert!(after > before + 2.0, "{before} -> {after} dB");
 }
 
+/// A live scan may be longer than the plan: what comes late is still given splats.
+#[test]
+fn a_late_keyframe_lets_the_model_grow_again() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = keyframes(&gpu, true);
+    let mut trainer = SplatTrainer::new(gpu, SplatOptions { max_splats: 8_000, ..options() }).unwrap();
+    for keyframe in &keyframes {
+        trainer.push(keyframe.clone()).unwrap();
+    }
+    let n_splats_after = |trainer: &mut SplatTrainer, n_steps| {
+        train(trainer, n_steps);
+        trainer.progress().primitives
+    };
+    let planned = n_splats_after(&mut trainer, 300);
+    assert_eq!(n_splats_after(&mut trainer, 200), planned, "growth is over");
+    // The same image again: there is nothing bare for seeds.
+    trainer.push(Arc::new(Keyframe { stamp: Stamp(99), ..keyframes[1].as_ref().clone() })).unwrap();
+    assert!(n_splats_after(&mut trainer, 120) > planned, "growth goes on");
+}
+
 /// Black splats look like no splats before a black background, but they hide what is behind them and have a depth.
 #[test]
 fn black_things_stay_solid() {

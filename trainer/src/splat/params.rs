@@ -136,7 +136,8 @@ pub(crate) struct Rule {
     pub(crate) log_scale_range: [f32; 2],
     pub(crate) seed: u32,
     pub(crate) update_all: u32,
-    pub(crate) unused: [u32; 2],
+    pub(crate) schedule_start: f32,
+    pub(crate) unused: u32,
 }
 
 /// `Supervision` of shared/supervision.wgsl: what a picture is compared with and how.

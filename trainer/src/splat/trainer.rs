@@ -68,6 +68,8 @@ pub struct SplatTrainer {
     scene_size_m: f64,
     has_depth: bool,
     step: u64,
+    /// Step from which the planned steps count: late keyframes set it forward.
+    schedule_start: u64,
     grown_at: u64,
     n_poisoned: u64,
     in_flight: Option<InFlight>,
@@ -130,6 +132,7 @@ impl SplatTrainer {
             scene_size_m: 1.0,
             has_depth: false,
             step: 0,
+            schedule_start: 0,
             grown_at: 0,
             n_poisoned: 0,
             in_flight: None,
@@ -280,12 +283,13 @@ impl SplatTrainer {
             betas: [0.9, 0.999],
             epsilon: 1e-15,
             n_planned_steps: f32_of(self.options.n_planned_steps as f64),
+            schedule_start: f32_of(self.schedule_start as f64),
             opacity_cost: cost,
             scale_cost: cost,
             log_scale_range: [(1e-5 * size).ln(), (2.0 * size).ln()],
             seed: (self.options.seed ^ (self.options.seed >> 32)) as u32,
             update_all: u32::from(!self.has_depth),
-            unused: [0; 2],
+            unused: 0,
         };
         self.gpu.write(&self.rule, 0, bytemuck::bytes_of(&rule));
     }
@@ -393,7 +397,7 @@ impl SplatTrainer {
 
     /// Changes the splat count when it is due: dead splats get new places, and there are more of them up to the cap.
     fn grow_when_due(&mut self, learn: &LearnPipelines) -> Result<(), Error> {
-        let last = (GROWTH_END_FRAC * self.options.n_planned_steps as f64) as u64;
+        let last = self.schedule_start + (GROWTH_END_FRAC * self.options.n_planned_steps as f64) as u64;
         let due = self.step >= GROWTH_START
             && self.step < last
             && self.step.is_multiple_of(GROWTH_PERIOD)
@@ -483,6 +487,8 @@ impl Method for SplatTrainer {
         }
         self.settle()?;
         self.has_depth |= keyframe.depth.is_some();
+        // What comes late finds at least half of the plan ahead of it: rates that still move things, and growth.
+        self.schedule_start = self.schedule_start.max(self.step.saturating_sub(self.options.n_planned_steps / 2));
         self.seed_from(&keyframe)?;
         self.views.push(TrainView::new(keyframe));
         self.measure_scene();

@@ -32,7 +32,8 @@ struct Rule {
     log_scale_range: vec2f,
     seed: u32,
     update_all: u32,              // 1: also splats that this view does not show
-    unused: vec2u,
+    schedule_start: f32,          // step from which the planned ones count
+    unused: u32,
 }
 
 @group(0) @binding(0) var<uniform> view: View;
@@ -183,7 +184,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
 
     let step = f32(atomicLoad(&status[STEP]));
     correction = 1.0 / (1.0 - pow(rule.betas, vec2f(step + 1.0)));
-    let done = min(step / max(rule.n_planned_steps, 1.0), 1.0);
+    let done = clamp((step - rule.schedule_start) / max(rule.n_planned_steps, 1.0), 0.0, 1.0);
     let mean_rate = rule.mean_rate_m * pow(rule.final_mean_rate_frac, done);
     // The costs double as the model gets able to fit what a single image shows.
     let cost_gradient = (1.0 + done) * vec4f(rule.scale_cost * p.scale, rule.opacity_cost * opacity * (1.0 - opacity));

@@ -43,7 +43,8 @@ pub(crate) fn update(
         rule.final_mean_rate_frac,
     ]
     .map(f64::from);
-    let done = (f64::from(step) / f64::from(rule.n_planned_steps).max(1.0)).min(1.0);
+    let since = f64::from(step) - f64::from(rule.schedule_start);
+    let done = (since / f64::from(rule.n_planned_steps).max(1.0)).clamp(0.0, 1.0);
     let mean_rate = of_mean * final_frac.powf(done);
     let opacity = sigmoid(splat.opacity_logit);
     let mut gradient = gradient.clone();
