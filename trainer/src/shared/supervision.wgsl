@@ -7,7 +7,7 @@ struct Supervision {
     dssim_frac: f32,          // share of D-SSIM in the color loss
     depth_weight: f32,        // per metre
     depth_clip_m: f32,        // past which a reading is ignored
-    varied_background: f32,   // 1: another background every step, so that leaving a place bare never pays
+    varied_background: f32,   // above 0: up to this bright, and another one every step, so that leaving a place bare never pays
 }
 
 const WINDOW = 11u;
