@@ -82,9 +82,32 @@ pub struct SplatTrainer {
 
 #[derive(Debug)]
 enum Learn {
-    Compiling(JoinHandle<Result<LearnPipelines, Error>>),
+    OnDemand,
+    Compiling(Compiling),
     Ready(Arc<LearnPipelines>),
     Failed,
+}
+
+/// Pipelines being compiled on a thread. Dropping it waits for the thread: where a process ends while its driver
+/// compiles, NVIDIA's corrupts the heap.
+#[derive(Debug)]
+struct Compiling(Option<JoinHandle<Result<LearnPipelines, Error>>>);
+
+impl Compiling {
+    fn start(gpu: &Arc<Gpu>) -> Self {
+        let gpu = gpu.clone();
+        Self(Some(std::thread::spawn(move || LearnPipelines::new(&gpu))))
+    }
+
+    fn finish(&mut self) -> Result<LearnPipelines, Error> {
+        self.0.take().and_then(|thread| thread.join().ok()).unwrap_or(Err(Error::DeviceLost))
+    }
+}
+
+impl Drop for Compiling {
+    fn drop(&mut self) {
+        let _ = self.finish();
+    }
 }
 
 #[derive(Debug)]
@@ -97,9 +120,12 @@ struct InFlight {
 impl SplatTrainer {
     /// An empty model. Drawing works at once; what learning needs is compiled on another thread.
     pub fn new(gpu: Arc<Gpu>, options: SplatOptions) -> Result<Self, Error> {
+        let learn = Learn::Compiling(Compiling::start(&gpu));
+        Self::with_learn(gpu, options, learn)
+    }
+
+    fn with_learn(gpu: Arc<Gpu>, options: SplatOptions, learn: Learn) -> Result<Self, Error> {
         let draw = DrawPipelines::new(&gpu)?;
-        let for_learning = gpu.clone();
-        let learn = Learn::Compiling(std::thread::spawn(move || LearnPipelines::new(&for_learning)));
         let zeros = [0u8; 4 * status::LEN];
         let software = gpu.is_software();
         Ok(Self {
@@ -146,10 +172,10 @@ impl SplatTrainer {
         })
     }
 
-    /// A model of given splats, to be drawn or trained on.
+    /// A model of given splats, to be drawn or trained on; what learning needs is compiled at the first step.
     pub fn from_arrays(gpu: Arc<Gpu>, options: SplatOptions, arrays: &SplatArrays) -> Result<Self, Error> {
         let options = SplatOptions { sh_degree: arrays.sh_degree, ..options };
-        let mut trainer = Self::new(gpu, options)?;
+        let mut trainer = Self::with_learn(gpu, options, Learn::OnDemand)?;
         trainer.add(arrays)?;
         Ok(trainer)
     }
@@ -187,14 +213,13 @@ impl SplatTrainer {
         if let Learn::Ready(ready) = &self.learn {
             return Ok(ready.clone());
         }
-        match std::mem::replace(&mut self.learn, Learn::Failed) {
-            Learn::Compiling(thread) => {
-                let ready = Arc::new(thread.join().map_err(|_| Error::DeviceLost)??);
-                self.learn = Learn::Ready(ready.clone());
-                Ok(ready)
-            }
-            _ => Err(Error::DeviceLost),
-        }
+        let ready = Arc::new(match std::mem::replace(&mut self.learn, Learn::Failed) {
+            Learn::Compiling(mut thread) => thread.finish()?,
+            Learn::OnDemand => LearnPipelines::new(&self.gpu)?,
+            Learn::Ready(_) | Learn::Failed => return Err(Error::DeviceLost),
+        });
+        self.learn = Learn::Ready(ready.clone());
+        Ok(ready)
     }
 
     /// Adds splats, up to the cap.
