@@ -1,7 +1,8 @@
-// capacity: how many intersections and buckets there is memory for.
+// capacity: how much there is memory for.
 
 struct Capacity {
-    n_isect: u32,
-    n_buckets: u32,
-    unused: vec2u,
+    n_entries: u32,    // of the bins' lists
+    n_slots: u32,      // gradients of intersections; 0: nothing is learned, and they need no memory
+    n_blocks: u32,     // blocks of 256 splats
+    unused: u32,
 }

@@ -7,11 +7,10 @@
 const LANES = 8u;
 const N_STRIPS = 8u;
 
-alias Px = vec4f;
-alias PxU = vec4u;
-alias PxB = vec4<bool>;
-const PX = 4u;
-const RAMP = Px(0.0, 1.0, 2.0, 3.0);
+#import pixels
+
+const QUEUE = 256u;
+var<workgroup> wg_queue: array<u32, QUEUE>;
 
 // Where in its tile the lane's first pixel of a strip lies.
 fn strip_px(strip: u32, lane: u32) -> vec2u {
@@ -42,4 +41,21 @@ fn sum_of_lanes(mine: vec4f) -> vec4f {
     var all = mine + subgroupShuffleXor(mine, 1u);
     all += subgroupShuffleXor(all, 2u);
     return all + subgroupShuffleXor(all, 4u);
+}
+
+// Queues the tile's entries from `next` on, in order, until the queue is full or the list ends: x how many, y the next.
+fn queue_entries(lane: u32, next: u32, end: u32, tile_bit: u32) -> vec2u {
+    workgroupBarrier(); // Nobody reads the queue any more.
+    var n = 0u;
+    var first = next;
+    while first < end && n + LANES <= QUEUE {
+        let entry = first + lane;
+        let mine = select(0u, 1u << lane, entry < end && (entry_tiles[min(entry, end - 1u)] & tile_bit) != 0u);
+        let kept = or_of_lanes(mine);
+        if mine != 0u { wg_queue[n + countOneBits(kept & (mine - 1u))] = entry; }
+        n += countOneBits(kept);
+        first += LANES;
+    }
+    workgroupBarrier(); // The queue is there.
+    return vec2u(n, first);
 }

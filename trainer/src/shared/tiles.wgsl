@@ -22,25 +22,46 @@ fn tile_rows(ellipse: Ellipse, n_tiles: vec2u) -> vec2i {
     return vec2i(begin, select(begin, end, last >= first));
 }
 
-// First and past-the-last column of tiles within a row of tiles.
-fn tile_columns(ellipse: Ellipse, row: i32, n_tiles: vec2u) -> vec2i {
+// Leftmost and rightmost point of the ellipse between two heights, both relative to its mean and one of them within it.
+fn span_between(ellipse: Ellipse, top: f32, bottom: f32) -> vec2f {
     let a = ellipse.conic.x;
     let b = ellipse.conic.y;
     let c = ellipse.conic.z;
     let determinant = a * c - b * b;
-    let top = f32(row) * 16.0 + 0.5 - TILE_MARGIN_PX - ellipse.mean_px.y;
-    let bottom = top + 15.0 + 2.0 * TILE_MARGIN_PX;
     let half_width = sqrt(max(ellipse.reach * c / determinant, 0.0));
     let slant = b / c * half_width;
     let at_right = clamp(-slant, top, bottom);
     let at_left = clamp(slant, top, bottom);
     let right = (-b * at_right + sqrt(max(a * ellipse.reach - determinant * at_right * at_right, 0.0))) / a + TILE_MARGIN_PX;
     let left = (-b * at_left - sqrt(max(a * ellipse.reach - determinant * at_left * at_left, 0.0))) / a - TILE_MARGIN_PX;
-    let first = ceil(clamp(ellipse.mean_px.x + left, -1e6, 1e6) - 0.5);
-    let last = floor(clamp(ellipse.mean_px.x + right, -1e6, 1e6) - 0.5);
+    return ellipse.mean_px.x + vec2f(left, right);
+}
+
+// First and past-the-last column of tiles within a row of tiles.
+fn tile_columns(ellipse: Ellipse, row: i32, n_tiles: vec2u) -> vec2i {
+    let top = f32(row) * 16.0 + 0.5 - TILE_MARGIN_PX - ellipse.mean_px.y;
+    let span = span_between(ellipse, top, top + 15.0 + 2.0 * TILE_MARGIN_PX);
+    let first = ceil(clamp(span.x, -1e6, 1e6) - 0.5);
+    let last = floor(clamp(span.y, -1e6, 1e6) - 0.5);
     let begin = clamp(i32(floor(first / 16.0)), 0, i32(n_tiles.x));
     let end = clamp(i32(floor(last / 16.0)) + 1, begin, i32(n_tiles.x));
     return vec2i(begin, select(begin, end, last >= first));
+}
+
+// Bit 2 row + column for each quarter of the tile, 8 x 8 pixels, that the ellipse may touch.
+fn quarters_touched(ellipse: Ellipse, corner_px: vec2f) -> u32 {
+    let determinant = ellipse.conic.x * ellipse.conic.z - ellipse.conic.y * ellipse.conic.y;
+    let half_height = sqrt(max(ellipse.reach * ellipse.conic.x / determinant, 0.0)) + TILE_MARGIN_PX;
+    var quarters = 0u;
+    for (var row = 0u; row < 2u; row++) {
+        let top = corner_px.y + 8.0 * f32(row) + 0.5 - TILE_MARGIN_PX - ellipse.mean_px.y;
+        let bottom = top + 7.0 + 2.0 * TILE_MARGIN_PX;
+        let span = span_between(ellipse, top, bottom) - corner_px.x;
+        let near = top <= half_height && bottom >= -half_height;
+        quarters |= select(0u, 1u, near && span.x <= 7.5 && span.y >= 0.5) << (2u * row);
+        quarters |= select(0u, 2u, near && span.x <= 15.5 && span.y >= 8.5) << (2u * row);
+    }
+    return quarters;
 }
 
 fn n_tiles_touched(ellipse: Ellipse, n_tiles: vec2u) -> u32 {

@@ -2,7 +2,7 @@
 #![expect(clippy::needless_range_loop, reason = "channels and axes index several arrays at once")]
 
 use super::arrays::SplatArrays;
-use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_tiles};
+use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
@@ -74,7 +74,7 @@ impl Bench {
         splats.append(&gpu, arrays);
         let tiles = n_tiles(view.size_px);
         let scratch =
-            Scratch::new(&gpu, &draw, ScratchSize { n_splats, n_isect: 1 << 14, n_buckets: 1 << 10, n_tiles: tiles })
+            Scratch::new(&gpu, &draw, ScratchSize { n_splats, n_entries: 1 << 14, n_slots: 1 << 14, n_bins: n_bins(view.size_px) })
                 .unwrap();
         let frame = Frame::new(&gpu, view.size_px[0] * view.size_px[1], tiles, true).unwrap();
         let mut counters = [0u32; status::LEN];
@@ -98,7 +98,7 @@ impl Bench {
 
     pub(super) fn render(&self) -> (Vec<[f32; 4]>, Vec<f32>) {
         let mut passes = Passes::default();
-        self.passes().draw(&mut passes, &self.draw, &self.learn.rasterize);
+        self.passes().draw(&mut passes, &self.draw);
         passes.submit(&self.gpu);
         let n = (self.size_px[0] * self.size_px[1]) as usize;
         (self.gpu.read(&self.frame.image, n).unwrap(), self.gpu.read(&self.frame.depth, n).unwrap())
@@ -242,9 +242,9 @@ fn check_gradients(
     let gradients_only = LearnPipelines::gradients_only(gpu).unwrap();
     let mut passes = Passes::default();
     let view_passes = bench.passes();
-    view_passes.draw(&mut passes, &bench.draw, &bench.learn.rasterize);
+    view_passes.draw(&mut passes, &bench.draw);
     view_passes.compare(&mut passes, &bench.learn, &wanted.target());
-    view_passes.backward(&mut passes, &bench.learn, &bench.draw);
+    view_passes.backward(&mut passes, &bench.learn);
     view_passes.update(&mut passes, &gradients_only, &rule);
     passes.submit(gpu);
     let n = target.rgb.len();
@@ -342,8 +342,8 @@ fn hidden_splats_have_no_gradient() {
         let gradients_only = LearnPipelines::gradients_only(gpu).unwrap();
         let mut passes = Passes::default();
         let view_passes = bench.passes();
-        view_passes.draw(&mut passes, &bench.draw, &bench.learn.rasterize);
-        view_passes.backward(&mut passes, &bench.learn, &bench.draw);
+        view_passes.draw(&mut passes, &bench.draw);
+        view_passes.backward(&mut passes, &bench.learn);
         view_passes.update(&mut passes, &gradients_only, &rule);
         passes.submit(gpu);
         let got = bench.splats.read(gpu).unwrap();

@@ -1,192 +1,131 @@
 // backward_strips: what `backward` does, on adapters whose lanes read memory one after the other.
 //
-// threads   a workgroup of 8 per bucket of 32 intersections (see `strips`); a lane owns four of them
+// threads   a workgroup of 8 per tile (see `strips`); of 32 splats at a time a lane owns four
 // reads     as `backward`
-// writes    gradients [n_isect]: every slot by its only owner
+// writes    gradients [n_slots]: every slot by its only owner
 // twin      splat/reference/rasterize.rs
 // source    as `backward`
 //
-// Strip after strip, the pixels' state stays in their lanes while the bucket's splats pass in order; each splat's
-// gradient is summed over the strip's pixels by shuffles and kept by its owner.
+// Strip after strip, the pixels' state stays in their lanes while 32 splats pass in order; each splat's gradient is summed
+// over the strip's pixels by shuffles and kept by its owner.
 
-#import view
-#import model
-#import projection
+#import backward_bindings
 #import strips
-#import status
-#import gradient
+#import coverage
+#import tile
 
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<storage, read> status: array<u32>;
-@group(0) @binding(2) var<storage, read> tile_ranges: array<vec2u>;
-@group(0) @binding(3) var<storage, read> bucket_starts: array<u32>;
-@group(0) @binding(4) var<storage, read> bucket_tiles: array<u32>;
-@group(0) @binding(5) var<storage, read> tile_last: array<u32>;
-@group(0) @binding(6) var<storage, read> sorted_splats: array<u32>;
-@group(0) @binding(7) var<storage, read> slots: array<u32>;
-@group(0) @binding(8) var<storage, read> drawn: array<Drawn>;
-@group(0) @binding(9) var<storage, read> bucket_color: array<vec4f>;
-@group(0) @binding(10) var<storage, read> bucket_depth: array<f32>;
-@group(0) @binding(11) var<storage, read> upstream: array<vec4f>;
-@group(0) @binding(12) var<storage, read> rest: array<vec2f>;
-@group(0) @binding(13) var<storage, read> last: array<u32>;
-@group(0) @binding(14) var<storage, read_write> gradients: array<Gradient>;
-
-const BUCKET = 32u;
-
-// The lane's pixels of the strip at hand.
-struct Pixels {
-    center_x: Px,
-    center_y: f32,
-    top: f32,          // centre of the strip's first row
-    v_red: Px,
-    v_green: Px,
-    v_blue: Px,
-    v_depth: Px,
-    error: Px,
-    last: PxU,
-    past_last: u32,    // the largest `last` of the strip
-    transmittance: Px, // in front of the splat at hand
-    behind: Px,        // what lies behind it, times its gradient
+const BATCH = 32u;
+// What lies around the splats at hand, between two batches.
+struct Between {
+    transmittance: Px,
+    behind: Px,
 }
+var<workgroup> wg_between: array<Between, 64>; // [N_STRIPS, LANES]
 
-// Eight of the bucket's splats, one a lane, and the sum of their gradients so far.
+// Eight of the batch's splats, one a lane, and the sum of their gradients so far.
 struct Owned {
-    rank: u32,         // within the tile
-    place: vec4f,
-    conic: vec4f,
-    color: vec4f,
-    v_place: vec4f,    // x, y still before the product with the conic
-    v_conic: vec4f,
-    v_color: vec4f,
+    entry: u32,        // past the list where the lane has none
+    splat: Drawn,
+    sum: Gradient,     // still before `finished`
 }
 
-fn owned_splat(rank: u32, n_in_tile: u32, begin: u32) -> Owned {
+fn owned_splat(at: u32, n_queued: u32) -> Owned {
     var own: Owned;
-    own.rank = rank;
-    own.conic.w = -1.0; // Reaches nothing.
-    if rank < n_in_tile {
-        let splat = drawn[sorted_splats[begin + rank]];
-        own.place = splat.place;
-        own.conic = splat.conic;
-        own.color = splat.color;
+    own.entry = 0xffffffffu;
+    own.splat.conic.w = -1.0; // Reaches nothing.
+    if at < n_queued {
+        own.entry = wg_queue[at];
+        own.splat = drawn[entry_splats[own.entry]];
     }
     return own;
 }
 
+// The lane's pixels of a strip.
+struct Strip {
+    center_x: Px,
+    center_y: f32,
+    top: f32,          // centre of the strip's first row
+    begin: u32,        // of the bin's list
+    past_last: u32,    // the largest `last` of the strip
+}
+
 // Lets eight splats pass the strip's pixels, in order.
-fn pass_strip(lane: u32, own: ptr<function, Owned>, pixels: ptr<function, Pixels>) {
-    let place = (*own).place;
-    let conic = (*own).conic;
-    let color = (*own).color;
-    let first = (*own).rank - lane;
-    let reaches = (*own).rank < (*pixels).past_last && reaches_strip(place, conic, (*pixels).top);
-    var reaching = or_of_lanes(select(0u, 1u << lane, conic.w >= 0.0 && reaches));
+fn pass_strip(lane: u32, own: ptr<function, Owned>, strip: Strip, pixels: ptr<function, Pixels>) {
+    let splat = (*own).splat;
+    let rank = (*own).entry - strip.begin;
+    let reaches = rank < strip.past_last && splat.conic.w >= 0.0 && reaches_strip(splat.place, splat.conic, strip.top);
+    var reaching = or_of_lanes(select(0u, 1u << lane, reaches));
     loop {
         let some = reaching != 0u; // The loop's body runs at least once.
         let i = firstTrailingBit(reaching) & 7u;
         reaching &= reaching - 1u;
-        let at = subgroupShuffle(place, i);
-        let shape = subgroupShuffle(conic, i);
-        let shade = subgroupShuffle(color, i);
-        let dx = at.x - (*pixels).center_x;
-        let dy = at.y - (*pixels).center_y;
-        let power = 0.5 * (shape.x * dx * dx + shape.z * dy * dy) + shape.y * dy * dx;
-        let hit = (PxU(first + i) < (*pixels).last) & (power >= Px(0.0)) & (power <= Px(0.5 * shape.w)) & PxB(some);
-        let falloff = select(Px(0.0), exp(-power), hit);
-        let unclamped = at.w * falloff;
-        let alpha = min(Px(MAX_ALPHA), unclamped);
-        let weight = alpha * (*pixels).transmittance;
-        let value = shade.x * (*pixels).v_red + shade.y * (*pixels).v_green + shade.z * (*pixels).v_blue + at.z * (*pixels).v_depth;
-        let behind = (*pixels).behind - weight * value;
-        let v_alpha = (*pixels).transmittance * value - behind / (1.0 - alpha);
-        let v_free = select(v_alpha, Px(0.0), unclamped > Px(MAX_ALPHA));
-        let v_power = -alpha * v_free;
-        (*pixels).transmittance *= 1.0 - alpha;
-        (*pixels).behind = behind;
-        let one = Px(1.0);
-        let v_place = sum_of_lanes(vec4f(
-            dot(v_power * dx, one), dot(v_power, one) * dy, dot(weight * (*pixels).v_depth, one), dot(falloff * v_free, one)));
-        let v_conic = sum_of_lanes(vec4f(
-            dot(v_power * dx * dx, one), dot(v_power * dx, one) * dy, dot(v_power, one) * dy * dy, dot(weight * (*pixels).error, one)));
-        let v_color = sum_of_lanes(vec4f(
-            dot(weight * (*pixels).v_red, one), dot(weight * (*pixels).v_green, one), dot(weight * (*pixels).v_blue, one), 0.0));
+        let passing = Drawn(subgroupShuffle(splat.place, i), subgroupShuffle(splat.conic, i), subgroupShuffle(splat.color, i));
+        let dx = passing.place.x - strip.center_x;
+        let dy = passing.place.y - strip.center_y;
+        let power = power_at(passing.conic, dx, dy);
+        let hit = (PxU(subgroupShuffle(rank, i)) < (*pixels).last) & within_reach(passing.conic, power) & PxB(some);
+        let part = passed(pixels, hit, power, dx, dy, passing);
         let mine = select(0.0, 1.0, some && lane == i);
-        (*own).v_place += mine * v_place;
-        (*own).v_conic += mine * v_conic;
-        (*own).v_color += mine * v_color;
+        (*own).sum.place += mine * sum_of_lanes(part.place);
+        (*own).sum.conic += mine * sum_of_lanes(part.conic);
+        (*own).sum.color += mine * sum_of_lanes(part.color);
         continuing {
             break if reaching == 0u;
         }
     }
 }
 
-fn hand_in(own: Owned, n_in_tile: u32, begin: u32) {
-    if own.rank < n_in_tile {
-        let moved = own.v_place.xy;
-        gradients[slots[begin + own.rank]] = Gradient(
-            vec4f(own.conic.x * moved.x + own.conic.y * moved.y, own.conic.y * moved.x + own.conic.z * moved.y, own.v_place.zw),
-            vec4f(0.5 * own.v_conic.x, own.v_conic.y, 0.5 * own.v_conic.z, own.v_conic.w),
-            own.v_color,
-        );
+fn hand_in(own: Owned, tile_bit: u32) {
+    if own.entry == 0xffffffffu { return; }
+    let sum = finished(own.sum, own.splat.conic);
+    let at = slot_of(own.entry, tile_bit) * N_PARTS_OF_GRADIENT;
+    for (var k = 0u; k < 4u; k++) {
+        gradients[at + k] = sum.place[k];
+        gradients[at + 4u + k] = sum.conic[k];
+        gradients[at + 8u + k] = sum.color[k];
     }
 }
 
 @compute @workgroup_size(LANES)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(subgroup_invocation_id) lane: u32) {
-    let bucket = folded(wg, n_wgs);
-    var n_in_tile = 0u;
-    var first = 0u;
-    var tile = 0u;
-    var past_last = 0u;
-    var begin = 0u;
-    if bucket < status[N_BUCKETS] && status[FAILED] == 0u {
-        tile = bucket_tiles[bucket];
-        let range = tile_ranges[tile];
-        begin = range.x;
-        first = (bucket - bucket_starts[tile]) * BUCKET;
-        n_in_tile = range.y - range.x;
-        past_last = tile_last[tile];
+    let tile = tile_at(folded(wg, n_wgs));
+    var most_of_tile = 0u;
+    for (var strip = 0u; strip < N_STRIPS; strip++) {
+        let pixels = pixels_at(tile, tile.corner + strip_px(strip, lane));
+        most_of_tile = max(most_of_tile, max(max(pixels.last.x, pixels.last.y), max(pixels.last.z, pixels.last.w)));
+        wg_between[strip * LANES + lane] = Between(pixels.transmittance, pixels.behind);
     }
-    let reached = first < past_last;
-    let corner = vec2u(tile % view.n_tiles.x, tile / view.n_tiles.x) * TILE_PX;
-    // Four by name and not an array: the compiler then keeps them out of memory that is read lane after lane.
-    var a = owned_splat(first + lane, n_in_tile, begin);
-    var b = owned_splat(first + lane + LANES, n_in_tile, begin);
-    var c = owned_splat(first + lane + 2u * LANES, n_in_tile, begin);
-    var d = owned_splat(first + lane + 3u * LANES, n_in_tile, begin);
-    for (var strip = 0u; strip < N_STRIPS && reached; strip++) {
-        let in_tile = strip_px(strip, lane);
-        let place = corner + in_tile;
-        var pixels: Pixels;
-        pixels.center_x = f32(place.x) + 0.5 + RAMP;
-        pixels.center_y = f32(place.y) + 0.5;
-        pixels.top = f32(corner.y + strip * 2u) + 0.5;
-        let state_at = bucket * 256u + in_tile.y * TILE_PX + in_tile.x;
-        for (var k = 0u; k < PX; k++) {
-            if place.x + k < view.size_px.x && place.y < view.size_px.y {
-                let at = place.y * view.size_px.x + place.x + k;
-                let front = bucket_color[state_at + k];
-                let slope = upstream[at];
-                let end = rest[at];
-                pixels.v_red[k] = slope.x;
-                pixels.v_green[k] = slope.y;
-                pixels.v_blue[k] = slope.z;
-                pixels.v_depth[k] = slope.w;
-                pixels.error[k] = end.y;
-                pixels.last[k] = last[at];
-                pixels.transmittance[k] = front.w;
-                pixels.behind[k] = end.x - dot(front.rgb, slope.rgb) - bucket_depth[state_at + k] * slope.w;
+    let past_last = max_of_lanes(most_of_tile);
+    var next = tile.begin;
+    while next < tile.end {
+        let queued = queue_entries(lane, next, tile.end, tile.bit);
+        next = queued.y;
+        for (var batch = 0u; batch < queued.x; batch += BATCH) {
+            // Four by name and not an array: the compiler then keeps them out of memory that is read lane after lane.
+            var a = owned_splat(batch + lane, queued.x);
+            var b = owned_splat(batch + lane + LANES, queued.x);
+            var c = owned_splat(batch + lane + 2u * LANES, queued.x);
+            var d = owned_splat(batch + lane + 3u * LANES, queued.x);
+            let reached = wg_queue[batch] - tile.begin < past_last; // Else they are hidden: nothing but zeros.
+            for (var strip_ix = 0u; strip_ix < N_STRIPS && reached; strip_ix++) {
+                let first = tile.corner + strip_px(strip_ix, lane);
+                var pixels = pixels_at(tile, first);
+                let between = wg_between[strip_ix * LANES + lane];
+                pixels.transmittance = between.transmittance;
+                pixels.behind = between.behind;
+                let most = max(max(pixels.last.x, pixels.last.y), max(pixels.last.z, pixels.last.w));
+                let top = f32(tile.corner.y + strip_ix * 2u) + 0.5;
+                let strip = Strip(f32(first.x) + 0.5 + RAMP, f32(first.y) + 0.5, top, tile.begin, max_of_lanes(most));
+                pass_strip(lane, &a, strip, &pixels);
+                pass_strip(lane, &b, strip, &pixels);
+                pass_strip(lane, &c, strip, &pixels);
+                pass_strip(lane, &d, strip, &pixels);
+                wg_between[strip_ix * LANES + lane] = Between(pixels.transmittance, pixels.behind);
             }
+            hand_in(a, tile.bit);
+            hand_in(b, tile.bit);
+            hand_in(c, tile.bit);
+            hand_in(d, tile.bit);
         }
-        pixels.past_last = max_of_lanes(max(max(pixels.last.x, pixels.last.y), max(pixels.last.z, pixels.last.w)));
-        pass_strip(lane, &a, &pixels);
-        pass_strip(lane, &b, &pixels);
-        pass_strip(lane, &c, &pixels);
-        pass_strip(lane, &d, &pixels);
     }
-    hand_in(a, n_in_tile, begin);
-    hand_in(b, n_in_tile, begin);
-    hand_in(c, n_in_tile, begin);
-    hand_in(d, n_in_tile, begin);
 }

@@ -4,7 +4,7 @@
 //! 0.9 image widths, a target of uniform noise, L1 loss, every splat updated in every step.
 
 use super::arrays::SplatArrays;
-use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_tiles};
+use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
@@ -76,7 +76,7 @@ pub fn time_kernels(
     bench.fit()?;
     let mut passes = Passes::default();
     let mean_rgb = bench.mean_rgb(&mut passes)?;
-    let n_isect = u64::from(bench.counters()?[status::N_ISECT as usize]);
+    let n_isect = u64::from(bench.counters()?[status::NEED_SLOTS]);
     let (render_millis, render_wall_millis) = bench.time(&mut passes, repeats, KernelBench::list_picture)?;
     let (step_millis, step_wall_millis) = bench.time(&mut passes, repeats, KernelBench::list_step)?;
     bench.list_step(&mut passes);
@@ -118,7 +118,7 @@ impl KernelBench {
             .map(|pixel| pixel.wrapping_mul(2_654_435_761).rotate_left(11).wrapping_mul(0x85eb_ca6b) | 0xff00_0000)
             .collect();
         let tiles = n_tiles(size_px);
-        let first_guess = ScratchSize { n_splats, n_isect: 1 << 14, n_buckets: 1 << 10, n_tiles: tiles };
+        let first_guess = ScratchSize { n_splats, n_entries: 1 << 14, n_slots: 1 << 14, n_bins: n_bins(size_px) };
         let mut counters = [0u32; status::LEN];
         counters[status::N_SPLATS as usize] = n_splats;
         Ok(Self {
@@ -142,21 +142,21 @@ impl KernelBench {
     fn fit(&mut self) -> Result<(), Error> {
         for _ in 0..2 {
             let mut passes = Passes::default();
-            self.view_passes().draw(&mut passes, &self.draw, &self.learn.rasterize);
+            self.view_passes().draw(&mut passes, &self.draw);
             passes.submit(&self.gpu);
             let counters = self.counters()?;
             let with_room = |need: u32| need + need / 16 + 64;
             let size = ScratchSize {
                 n_splats: self.splats.n_splats,
-                n_isect: with_room(counters[status::NEED_ISECT]),
-                n_buckets: with_room(counters[status::NEED_BUCKETS].max(1)),
-                n_tiles: n_tiles(self.size_px),
+                n_entries: with_room(counters[status::NEED_ENTRIES]),
+                n_slots: with_room(counters[status::NEED_SLOTS]),
+                n_bins: n_bins(self.size_px),
             };
             drop(passes);
             self.scratch = Scratch::new(
                 &self.gpu,
                 &self.draw,
-                ScratchSize { n_splats: self.splats.n_splats, n_isect: 1, n_buckets: 1, n_tiles: 1 },
+                ScratchSize { n_splats: 1, n_entries: 1, n_slots: 1, n_bins: 1 },
             )?;
             self.scratch = Scratch::new(&self.gpu, &self.draw, size)?;
             self.gpu.write(&self.status, 4 * status::FAILED as u64, &[0; 12]);
@@ -177,18 +177,18 @@ impl KernelBench {
     }
 
     fn list_picture(&self, passes: &mut Passes) {
-        self.view_passes().draw(passes, &self.draw, &self.draw.rasterize);
+        self.view_passes().draw(passes, &self.draw);
     }
 
     fn list_step(&self, passes: &mut Passes) {
         let view = self.view_passes();
-        view.draw(passes, &self.draw, &self.learn.rasterize);
+        view.draw(passes, &self.draw);
         view.compare(
             passes,
             &self.learn,
             &Target { image: &self.image, depth: &self.depth, supervision: &self.supervision, ssim: false },
         );
-        view.backward(passes, &self.learn, &self.draw);
+        view.backward(passes, &self.learn);
         view.update(passes, &self.learn.update, &self.rule);
         passes.dispatch(&self.gpu, &self.learn.advance, 1, &[("status", &self.status)]);
     }

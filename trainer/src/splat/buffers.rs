@@ -189,21 +189,18 @@ impl SplatBuffers {
 /// What one view of the model needs while it is drawn, and learned from.
 #[derive(Debug)]
 pub(crate) struct Scratch {
-    pub(crate) n_isect: u32,
-    pub(crate) n_buckets: u32,
-    pub(crate) n_tile_bits: u32,
     pub(crate) capacity: Buffer,
     pub(crate) drawn: Buffer,
     pub(crate) tile_counts: Buffer,
     pub(crate) slot_offsets: Buffer,
-    pub(crate) block_sums: Buffer,
+    pub(crate) block_slots: Buffer,
     pub(crate) by_depth: SortBuffers,
-    pub(crate) by_tile: SortBuffers,
-    pub(crate) slot_splats: Buffer,
-    pub(crate) sorted_splats: Buffer,
-    pub(crate) bucket_tiles: Buffer,
-    pub(crate) bucket_color: Buffer,
-    pub(crate) bucket_depth: Buffer,
+    pub(crate) bin_counts: Buffer,
+    pub(crate) bin_totals: Buffer,
+    pub(crate) bin_starts: Buffer,
+    pub(crate) entry_tiles: Buffer,
+    pub(crate) entry_splats: Buffer,
+    pub(crate) entry_slots: Buffer,
     pub(crate) gradients: Buffer,
 }
 
@@ -211,37 +208,32 @@ pub(crate) struct Scratch {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct ScratchSize {
     pub(crate) n_splats: u32,
-    pub(crate) n_isect: u32,
-    /// 0 where nothing is learned.
-    pub(crate) n_buckets: u32,
-    pub(crate) n_tiles: u32,
+    /// Of the bins' lists.
+    pub(crate) n_entries: u32,
+    /// Intersections of splats and tiles; 0 where nothing is learned.
+    pub(crate) n_slots: u32,
+    pub(crate) n_bins: u32,
 }
 
 impl Scratch {
     pub(crate) fn new(gpu: &Gpu, pipelines: &DrawPipelines, size: ScratchSize) -> Result<Self, Error> {
         let words = |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n.max(1)));
-        let n_tile_bits = 32 - size.n_tiles.leading_zeros(); // One past the last tile is a key, too.
-        let learned = if size.n_buckets == 0 { 0 } else { u64::from(size.n_isect) };
+        let n_blocks = size.n_splats.div_ceil(256);
+        let ScratchSize { n_splats, n_entries, n_slots, n_bins } = size;
         Ok(Self {
-            n_isect: size.n_isect,
-            n_buckets: size.n_buckets,
-            n_tile_bits,
-            capacity: gpu.uniform_with(
-                "splat.capacity",
-                &Capacity { n_isect: size.n_isect, n_buckets: size.n_buckets, unused: [0; 2] },
-            ),
-            drawn: gpu.storage("splat.drawn", 48 * u64::from(size.n_splats))?,
-            tile_counts: words("splat.tile_counts", size.n_splats)?,
-            slot_offsets: words("splat.slot_offsets", size.n_splats)?,
-            block_sums: words("splat.block_sums", size.n_splats.div_ceil(1024))?,
-            by_depth: pipelines.sort.buffers(gpu, "splat.by_depth", size.n_splats, DEPTH_BITS, status::N_SPLATS)?,
-            by_tile: pipelines.sort.buffers(gpu, "splat.by_tile", size.n_isect, n_tile_bits, status::N_ISECT)?,
-            slot_splats: words("splat.slot_splats", size.n_isect)?,
-            sorted_splats: words("splat.sorted_splats", size.n_isect)?,
-            bucket_tiles: words("splat.bucket_tiles", size.n_buckets)?,
-            bucket_color: gpu.storage("splat.bucket_color", 4096 * u64::from(size.n_buckets))?,
-            bucket_depth: gpu.storage("splat.bucket_depth", 1024 * u64::from(size.n_buckets))?,
-            gradients: gpu.storage("splat.gradients", 48 * learned)?,
+            capacity: gpu.uniform_with("splat.capacity", &Capacity { n_entries, n_slots, n_blocks, unused: 0 }),
+            drawn: gpu.storage("splat.drawn", 48 * u64::from(n_splats))?,
+            tile_counts: words("splat.tile_counts", n_splats)?,
+            slot_offsets: words("splat.slot_offsets", n_splats)?,
+            block_slots: words("splat.block_slots", n_blocks)?,
+            by_depth: pipelines.sort.buffers(gpu, "splat.by_depth", n_splats, DEPTH_BITS, status::N_SPLATS)?,
+            bin_counts: gpu.storage("splat.bin_counts", 4 * u64::from(n_bins) * u64::from(n_blocks.max(1)))?,
+            bin_totals: words("splat.bin_totals", n_bins)?,
+            bin_starts: words("splat.bin_starts", n_bins + 1)?,
+            entry_tiles: words("splat.entry_tiles", n_entries)?,
+            entry_splats: words("splat.entry_splats", n_entries)?,
+            entry_slots: words("splat.entry_slots", n_entries)?,
+            gradients: gpu.storage("splat.gradients", 48 * u64::from(n_slots))?,
         })
     }
 }
@@ -254,9 +246,6 @@ pub(crate) struct Frame {
     pub(crate) image: Buffer,
     pub(crate) depth: Buffer,
     pub(crate) last: Buffer,
-    pub(crate) tile_ranges: Buffer,
-    pub(crate) bucket_starts: Buffer,
-    pub(crate) tile_last: Buffer,
     pub(crate) pixels: Buffer,
     pub(crate) depths: Buffer,
     pub(crate) slopes: Buffer,
@@ -277,9 +266,6 @@ impl Frame {
             image: each("splat.image", 16)?,
             depth: each("splat.depth", 4)?,
             last: each("splat.last", 4)?,
-            tile_ranges: tiles("splat.tile_ranges", 8)?,
-            bucket_starts: tiles("splat.bucket_starts", 4)?,
-            tile_last: tiles("splat.tile_last", 4)?,
             pixels: each("splat.pixels", 4)?,
             depths: each("splat.depths", 4)?,
             slopes: slope("splat.slopes", 36)?,
@@ -288,6 +274,11 @@ impl Frame {
             errors: tiles("splat.errors", 4)?,
         })
     }
+}
+
+/// Bins of 4 x 4 tiles of an image.
+pub(crate) fn n_bins(size_px: [u32; 2]) -> u32 {
+    size_px[0].div_ceil(4 * TILE_PX) * size_px[1].div_ceil(4 * TILE_PX)
 }
 
 /// Tiles of an image.

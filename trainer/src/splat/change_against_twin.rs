@@ -108,9 +108,9 @@ fn optimiser_steps_match_the_twin() {
 
         let mut passes = Passes::default();
         let view_passes = bench.passes();
-        view_passes.draw(&mut passes, &bench.draw, &bench.learn.rasterize);
+        view_passes.draw(&mut passes, &bench.draw);
         view_passes.compare(&mut passes, &bench.learn, &wanted.target());
-        view_passes.backward(&mut passes, &bench.learn, &bench.draw);
+        view_passes.backward(&mut passes, &bench.learn);
         view_passes.update(&mut passes, &bench.learn.update, &rule);
         passes.submit(gpu);
         gpu.write(&bench.status, 4 * status::STEP as u64, bytemuck::bytes_of(&(step + 1)));
@@ -184,12 +184,22 @@ fn tiles_list_every_splat_that_reaches_them_in_order_of_depth() {
     let gpu = &bench.gpu;
     let drawn: Vec<[[f32; 4]; 3]> = gpu.read(&bench.scratch.drawn, splats.len()).unwrap();
     let n_tiles = view.size_px.map(|size| size.div_ceil(16));
-    let ranges: Vec<[u32; 2]> = gpu.read(&bench.frame.tile_ranges, (n_tiles[0] * n_tiles[1]) as usize).unwrap();
-    let n_isect = ranges.iter().map(|range| range[1]).max().unwrap();
-    let listed: Vec<u32> = gpu.read(&bench.scratch.sorted_splats, n_isect as usize).unwrap();
+    let n_bins = n_tiles.map(|n| n.div_ceil(4));
+    let starts: Vec<u32> = gpu.read(&bench.scratch.bin_starts, (n_bins[0] * n_bins[1]) as usize + 1).unwrap();
+    let n_entries = starts[starts.len() - 1] as usize;
+    let [masks, splat_of, slots] = [&bench.scratch.entry_tiles, &bench.scratch.entry_splats, &bench.scratch.entry_slots]
+        .map(|buffer| gpu.read::<u32>(buffer, n_entries).unwrap());
+    let mut taken: Vec<u32> =
+        masks.iter().zip(&slots).flat_map(|(tiles, slot)| *slot..*slot + tiles.count_ones()).collect();
+    taken.sort_unstable();
+    assert!(taken.iter().copied().eq(0..u32::try_from(taken.len()).unwrap()), "every slot has one owner");
     let (mut n_listed, mut n_needless) = (0, 0);
-    for (tile, range) in (0..).zip(&ranges) {
-        let list = &listed[range[0] as usize..range[1] as usize];
+    for tile in 0..n_tiles[0] * n_tiles[1] {
+        let at = [tile % n_tiles[0], tile / n_tiles[0]];
+        let bin = (at[1] / 4 * n_bins[0] + at[0] / 4) as usize;
+        let bit = 1 << (at[1] % 4 * 4 + at[0] % 4);
+        let entries = (starts[bin] as usize..starts[bin + 1] as usize).filter(|entry| masks[*entry] & bit != 0);
+        let list: Vec<u32> = entries.map(|entry| splat_of[entry]).collect();
         let depths: Vec<f32> = list.iter().map(|ix| drawn[*ix as usize][0][2]).collect();
         // Depth keys leave out the last three bits.
         assert!(depths.windows(2).all(|pair| pair[0] <= pair[1] * (1.0 + 1e-6)), "tile {tile} is out of order");

@@ -1,72 +1,82 @@
-// emit: list the tiles of every splat, splats in order of depth; a splat's intersections are neighbours.
+// emit: list every splat in the bins it reaches, in order of depth.
 //
-// threads   256 per block of 1024 splats
-// reads     view, model, by_depth, tile_counts, drawn, block_sums (offsets), status
-// writes    tile_keys [n_isect], slot_splats [n_isect], slot_offsets [n_splats]
+// threads   256 per block of 256 splats, taken in order of depth, and window of 512 bins
+// reads     view, model, capacity, by_depth, drawn, bin_counts (offsets), bin_starts, slot_offsets, block_slots, status
+// writes    entry_tiles [n_entries] (mask of the bin's tiles), entry_splats [n_entries], entry_slots [n_entries] (of the
+//           lowest tile; the others follow), tile_counts [n_splats] (where rounding found other tiles than `project` did)
 //
-// The count of `project` holds: should rounding find other tiles here, the list is cut, or filled with a tile past the last.
+// The counts of `count_bins` and `project` hold: should rounding find others here, lists are cut or filled with entries
+// of no tile.
 
 #import view
 #import model
-#import tiles
-#import scan
+#import bins
+#import block_bins
 #import status
+#import capacity
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> model: Model;
-@group(0) @binding(2) var<storage, read> by_depth: array<u32>;
-@group(0) @binding(3) var<storage, read> tile_counts: array<u32>;
+@group(0) @binding(2) var<uniform> capacity: Capacity;
+@group(0) @binding(3) var<storage, read> by_depth: array<u32>;
 @group(0) @binding(4) var<storage, read> drawn: array<Drawn>;
-@group(0) @binding(5) var<storage, read> block_sums: array<u32>;
-@group(0) @binding(6) var<storage, read> status: array<u32>;
-@group(0) @binding(7) var<storage, read_write> tile_keys: array<u32>;
-@group(0) @binding(8) var<storage, read_write> slot_splats: array<u32>;
-@group(0) @binding(9) var<storage, read_write> slot_offsets: array<u32>;
+@group(0) @binding(5) var<storage, read> bin_counts: array<u32>;
+@group(0) @binding(6) var<storage, read> bin_totals: array<u32>;
+@group(0) @binding(7) var<storage, read> bin_starts: array<u32>;
+@group(0) @binding(8) var<storage, read> slot_offsets: array<u32>;
+@group(0) @binding(9) var<storage, read> block_slots: array<u32>;
+@group(0) @binding(10) var<storage, read> status: array<u32>;
+@group(0) @binding(11) var<storage, read_write> tile_counts: array<u32>;
+@group(0) @binding(12) var<storage, read_write> entry_tiles: array<u32>;
+@group(0) @binding(13) var<storage, read_write> entry_splats: array<u32>;
+@group(0) @binding(14) var<storage, read_write> entry_slots: array<u32>;
 
-const BLOCK = 1024u;
-var<workgroup> wg_splats: array<u32, BLOCK>;
-var<workgroup> wg_begins: array<u32, BLOCK>;
+// Where a block's entries of a bin of the window begin, and past their end.
+fn room(at: BlockAndWindow, bin_in_window: u32) -> vec2u {
+    let bin = at.first_bin + bin_in_window;
+    var end = bin_totals[bin];
+    if at.block + 1u < n_blocks_in_use() { end = bin_counts[bin * capacity.n_blocks + at.block + 1u]; }
+    return bin_starts[bin] + vec2u(bin_counts[bin * capacity.n_blocks + at.block], end);
+}
 
-@compute @workgroup_size(256)
+// The lowest bits of a mask, no more than `n`.
+fn lowest_bits(mask: u32, n: u32) -> u32 {
+    var kept = mask;
+    while countOneBits(kept) > n { kept &= ~(1u << firstLeadingBit(kept)); }
+    return kept;
+}
+
+@compute @workgroup_size(BLOCK)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
-    let block = folded(wg, n_wgs);
-    let n_in_block = min(BLOCK, max(model.n_splats, block * BLOCK) - block * BLOCK);
-    var begins = vec4u(0u);
-    var sum = 0u;
-    for (var i = 0u; i < 4u; i++) {
-        let rank = lane * 4u + i;
-        begins[i] = sum;
-        if rank < n_in_block {
-            let splat_ix = by_depth[block * BLOCK + rank];
-            wg_splats[rank] = splat_ix;
-            sum += tile_counts[splat_ix];
+    let at = block_and_window(folded(wg, n_wgs));
+    mark_bins(lane, at);
+    if status[N_ENTRIES] == 0u || at.block >= n_blocks_in_use() { return; } // Past the last barrier.
+    let listed = listed_splat(lane, at.block);
+    let bin_rows = bin_rows(listed);
+    let n_columns = n_bins(view.n_tiles).x;
+    let begin = block_slots[listed.splat_ix / BLOCK] + slot_offsets[listed.splat_ix];
+    let n_touched = tile_counts[listed.splat_ix];
+    var n_given = 0u;
+    for (var row = bin_rows.x; row < bin_rows.y; row++) {
+        let bin_row = bin_row(listed.ellipse, row, listed.rows, view.n_tiles);
+        let columns = bin_columns(bin_row);
+        for (var column = columns.x; column < columns.y; column++) {
+            let tiles = lowest_bits(tiles_in_bin(bin_row, column), n_touched - n_given);
+            let slot = begin + n_given;
+            n_given += countOneBits(tiles);
+            let bin = u32(row) * n_columns + u32(column) - at.first_bin; // Wraps where the bin is before the window.
+            if bin >= at.n_bins || tiles_in_bin(bin_row, column) == 0u { continue; }
+            let room = room(at, bin);
+            let entry = room.x + n_marked(bin, lane);
+            if entry >= room.y { continue; }
+            entry_tiles[entry] = tiles;
+            entry_splats[entry] = listed.splat_ix;
+            entry_slots[entry] = slot;
         }
     }
-    var total = 0u;
-    let before = exclusive_scan(lane, sum, &total);
-    for (var i = 0u; i < 4u; i++) { wg_begins[lane * 4u + i] = before + begins[i]; }
-    workgroupBarrier(); // The block's list is there; from here on neighbouring lanes take neighbouring splats.
-    if status[N_ISECT] == 0u { return; } // Past the last barrier.
-    for (var rank = lane; rank < n_in_block; rank += 256u) {
-        let splat_ix = wg_splats[rank];
-        var slot = block_sums[block] + wg_begins[rank];
-        let end = slot + tile_counts[splat_ix];
-        slot_offsets[splat_ix] = slot;
-        if slot == end { continue; }
-        let splat = drawn[splat_ix];
-        let ellipse = Ellipse(splat.place.xy, splat.conic.xyz, splat.conic.w);
-        let rows = tile_rows(ellipse, view.n_tiles);
-        for (var row = rows.x; row < rows.y; row++) {
-            let columns = tile_columns(ellipse, row, view.n_tiles);
-            for (var column = columns.x; column < columns.y && slot < end; column++) {
-                tile_keys[slot] = u32(row) * view.n_tiles.x + u32(column);
-                slot_splats[slot] = splat_ix;
-                slot++;
-            }
-        }
-        for (; slot < end; slot++) {
-            tile_keys[slot] = view.n_tiles.x * view.n_tiles.y;
-            slot_splats[slot] = splat_ix;
-        }
+    if bin_rows.y > bin_rows.x && n_given < n_touched { tile_counts[listed.splat_ix] = n_given; }
+    for (var bin = lane; bin < at.n_bins; bin += BLOCK) {
+        let room = room(at, bin);
+        for (var entry = room.x + n_marked(bin, BLOCK); entry < room.y; entry++) { entry_tiles[entry] = 0u; }
     }
 }

@@ -18,12 +18,13 @@ const STATUS: Source = source!("status");
 const MODEL: Source = source!("model");
 const PROJECTION: Source = source!("projection");
 const GRADIENT: Source = source!("gradient");
+const TILES: Source = source!("tiles");
+const BINS: Source = source!("bins");
 const SHARED: &[Source] = &[
     VIEW,
     STATUS,
     MODEL,
     PROJECTION,
-    source!("tiles"),
     source!("sh"),
     source!("scan"),
     source!("scan_f32"),
@@ -32,18 +33,30 @@ const SHARED: &[Source] = &[
     source!("growth"),
     source!("capacity"),
     GRADIENT,
+    BINS,
+    TILES,
+    source!("block_bins"),
 ];
-/// What the kernels over pixels import: how many pixels a lane takes, and how a lane hears of the others.
+/// What the kernels over pixels import.
 macro_rules! blend_sources {
     ($($source:expr),*) => {
-        &[VIEW, STATUS, MODEL, PROJECTION, GRADIENT, $($source),*]
+        &[
+            VIEW, STATUS, MODEL, PROJECTION, GRADIENT, TILES, BINS,
+            source!("rasterize_bindings"), source!("backward_bindings"), source!("coverage"), source!("tile"), $($source),*
+        ]
     };
 }
-const BLEND_2: &[Source] = blend_sources!(source!("pixels", "pixels_2"), source!("handover", "handover_subgroup"));
-const BLEND_4: &[Source] = blend_sources!(source!("pixels", "pixels_4"), source!("handover", "handover_subgroup"));
-const BLEND_4_BY_MEMORY: &[Source] =
-    blend_sources!(source!("pixels", "pixels_4"), source!("handover", "handover_memory"));
-const BLEND_STRIPS: &[Source] = blend_sources!(source!("strips"));
+const BLEND: &[Source] = blend_sources!(
+    source!("pixels", "pixels_2"),
+    source!("tile_queue"),
+    source!("sums", "sums_subgroup")
+);
+const BLEND_BY_MEMORY: &[Source] = blend_sources!(
+    source!("pixels", "pixels_2"),
+    source!("tile_queue"),
+    source!("sums", "sums_memory")
+);
+const BLEND_STRIPS: &[Source] = blend_sources!(source!("pixels", "pixels_4"), source!("strips"));
 
 macro_rules! kernel {
     ($name:literal) => {
@@ -64,47 +77,43 @@ macro_rules! kernel {
 struct Blend {
     rasterize: Kernel,
     backward: Kernel,
-    /// Lanes of a workgroup of `backward`, where it leaves the choice.
-    lanes: Option<u32>,
+    /// Lanes of a subgroup, where `backward` must know.
+    subgroup: Option<u32>,
 }
 
 fn blend(gpu: &Gpu) -> Blend {
-    let tiles = |shared, lanes: u32| Blend {
-        rasterize: kernel!("rasterize", shared),
-        backward: kernel!("backward", shared),
-        lanes: Some(lanes.min(32)),
-    };
     match gpu.optional().subgroup_lanes {
-        None => tiles(BLEND_4_BY_MEMORY, 32),
         // Software adapters: no processor made for pictures has subgroups of 8 and no other.
         Some(8) => Blend {
             rasterize: kernel!("rasterize_strips", BLEND_STRIPS),
             backward: kernel!("backward_strips", BLEND_STRIPS),
-            lanes: None,
+            subgroup: None,
         },
-        // Wide subgroups idle while the first group travels through them: fewer pixels a lane, more rounds, less idling.
-        Some(lanes) if lanes >= 16 => tiles(BLEND_2, lanes),
-        Some(lanes) => tiles(BLEND_4, lanes),
+        Some(lanes) if (16..=128).contains(&lanes) => {
+            Blend { rasterize: kernel!("rasterize", BLEND), backward: kernel!("backward", BLEND), subgroup: Some(lanes) }
+        }
+        _ => Blend {
+            rasterize: kernel!("rasterize", BLEND),
+            backward: kernel!("backward", BLEND_BY_MEMORY),
+            subgroup: None,
+        },
     }
 }
 
 /// All kernels of this module, for validation.
 pub const KERNELS: &[Kernel] = &[
     kernel!("project"),
-    kernel!("count_blocks"),
-    kernel!("scan_blocks"),
+    kernel!("count_bins"),
+    kernel!("scan_bins"),
+    kernel!("allocate"),
     kernel!("emit"),
-    kernel!("ranges"),
-    kernel!("bucket_offsets"),
-    kernel!("rasterize", BLEND_2),
-    kernel!("rasterize", BLEND_4),
+    kernel!("rasterize", BLEND),
     kernel!("rasterize_strips", BLEND_STRIPS),
     kernel!("finish"),
     kernel!("loss", "ssim", SHARED),
     kernel!("loss", "loss_backward", SHARED),
-    kernel!("backward", BLEND_2),
-    kernel!("backward", BLEND_4),
-    kernel!("backward", BLEND_4_BY_MEMORY),
+    kernel!("backward", BLEND),
+    kernel!("backward", BLEND_BY_MEMORY),
     kernel!("backward_strips", BLEND_STRIPS),
     kernel!("update"),
     kernel!("advance"),
@@ -119,11 +128,10 @@ pub const KERNELS: &[Kernel] = &[
 pub(crate) struct DrawPipelines {
     pub(crate) sort: RadixSort,
     pub(crate) project: Pipeline,
-    pub(crate) count_blocks: Pipeline,
-    pub(crate) scan_blocks: Pipeline,
+    pub(crate) count_bins: Pipeline,
+    pub(crate) scan_bins: Pipeline,
+    pub(crate) allocate: Pipeline,
     pub(crate) emit: Pipeline,
-    pub(crate) ranges: Pipeline,
-    pub(crate) bucket_offsets: Pipeline,
     pub(crate) rasterize: Pipeline,
     pub(crate) finish: Pipeline,
 }
@@ -133,12 +141,11 @@ impl DrawPipelines {
         Ok(Self {
             sort: RadixSort::new(gpu)?,
             project: Pipeline::new(gpu, kernel!("project"), &[])?,
-            count_blocks: Pipeline::new(gpu, kernel!("count_blocks"), &[])?,
-            scan_blocks: Pipeline::new(gpu, kernel!("scan_blocks"), &[])?,
+            count_bins: Pipeline::new(gpu, kernel!("count_bins"), &[])?,
+            scan_bins: Pipeline::new(gpu, kernel!("scan_bins"), &[])?,
+            allocate: Pipeline::new(gpu, kernel!("allocate"), &[])?,
             emit: Pipeline::new(gpu, kernel!("emit"), &[])?,
-            ranges: Pipeline::new(gpu, kernel!("ranges"), &[])?,
-            bucket_offsets: Pipeline::new(gpu, kernel!("bucket_offsets"), &[])?,
-            rasterize: Pipeline::new(gpu, blend(gpu).rasterize, &[("STATES", 0.0)])?,
+            rasterize: Pipeline::new(gpu, blend(gpu).rasterize, &[])?,
             finish: Pipeline::new(gpu, kernel!("finish"), &[])?,
         })
     }
@@ -147,7 +154,6 @@ impl DrawPipelines {
 /// What learning needs on top.
 #[derive(Debug)]
 pub(crate) struct LearnPipelines {
-    pub(crate) rasterize: Pipeline,
     pub(crate) ssim: Pipeline,
     pub(crate) loss: Pipeline,
     pub(crate) loss_without_ssim: Pipeline,
@@ -163,9 +169,8 @@ pub(crate) struct LearnPipelines {
 impl LearnPipelines {
     pub(crate) fn new(gpu: &Gpu) -> Result<Self, Error> {
         let blend = blend(gpu);
-        let lanes: Vec<_> = blend.lanes.map(|lanes| ("LANES", f64::from(lanes))).into_iter().collect();
+        let lanes: Vec<_> = blend.subgroup.map(|lanes| ("SUBGROUP", f64::from(lanes))).into_iter().collect();
         Ok(Self {
-            rasterize: Pipeline::new(gpu, blend.rasterize, &[("STATES", 1.0)])?,
             ssim: Pipeline::new(gpu, kernel!("loss", "ssim", SHARED), &[])?,
             loss: Pipeline::new(gpu, kernel!("loss", "loss_backward", SHARED), &[("SSIM", 1.0)])?,
             loss_without_ssim: Pipeline::new(gpu, kernel!("loss", "loss_backward", SHARED), &[("SSIM", 0.0)])?,
@@ -263,7 +268,7 @@ mod tests {
         );
         assert_layout!(Supervision, [background_srgb, dssim_frac, depth_weight, depth_clip_m, varied_background]);
         assert_layout!(Growth, [n_before, n_after, key, capacity, n_sh_rest, child_spread, least_opacity, unused]);
-        assert_layout!(Capacity, [n_isect, n_buckets, unused]);
+        assert_layout!(Capacity, [n_entries, n_slots, n_blocks, unused]);
     }
 
     #[test]

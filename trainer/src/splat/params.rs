@@ -107,13 +107,14 @@ pub(crate) struct Model {
     pub(crate) n_sh_rest: u32,
 }
 
-/// `Capacity` of `scan_blocks.wgsl` and `bucket_offsets.wgsl`.
+/// `Capacity` of shared/capacity.wgsl.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct Capacity {
-    pub(crate) n_isect: u32,
-    pub(crate) n_buckets: u32,
-    pub(crate) unused: [u32; 2],
+    pub(crate) n_entries: u32,
+    pub(crate) n_slots: u32,
+    pub(crate) n_blocks: u32,
+    pub(crate) unused: u32,
 }
 
 /// `Rule` of update.wgsl: how parameters learn.
@@ -154,10 +155,9 @@ pub(crate) struct Supervision {
 /// Indices into the status array, as in shared/status.wgsl.
 pub(crate) mod status {
     pub(crate) const N_SPLATS: u32 = 0;
-    pub(crate) const N_ISECT: u32 = 1;
     pub(crate) const FAILED: usize = 3;
-    pub(crate) const NEED_ISECT: usize = 4;
-    pub(crate) const NEED_BUCKETS: usize = 5;
+    pub(crate) const NEED_ENTRIES: usize = 4;
+    pub(crate) const NEED_SLOTS: usize = 5;
     pub(crate) const STEP: usize = 6;
     pub(crate) const N_POISONED: usize = 7;
     /// Length of the array.

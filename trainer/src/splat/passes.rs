@@ -1,6 +1,6 @@
 //! The stages of drawing and learning, as lists of passes.
 
-use super::buffers::{DEPTH_BITS, Frame, Scratch, SplatBuffers, n_tiles};
+use super::buffers::{DEPTH_BITS, Frame, Scratch, SplatBuffers, n_bins, n_tiles};
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::params::Growth;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
@@ -100,17 +100,19 @@ pub(crate) fn grow(
 }
 
 impl ViewPasses<'_> {
-    /// Projects, sorts, bins and rasterizes; `rasterize` is the form that keeps states or the one that does not.
-    pub(crate) fn draw(&self, passes: &mut Passes, pipelines: &DrawPipelines, rasterize: &Pipeline) {
+    /// Projects, sorts, bins and rasterizes.
+    pub(crate) fn draw(&self, passes: &mut Passes, pipelines: &DrawPipelines) {
         let Self { gpu, splats, scratch, frame, status, view, size_px } = *self;
-        let n_blocks = u64::from(splats.n_splats.div_ceil(1024));
+        let n_blocks = u64::from(splats.n_splats.div_ceil(256));
+        let (model, capacity) = (("model", &splats.model), ("capacity", &scratch.capacity));
+        let view = ("view", view);
         passes.dispatch(
             gpu,
             &pipelines.project,
-            u64::from(splats.n_splats.div_ceil(256)),
+            n_blocks,
             &[
-                ("view", view),
-                ("model", &splats.model),
+                view,
+                model,
                 ("means", &splats.means),
                 ("rotations", &splats.rotations),
                 ("shapes", &splats.shapes),
@@ -119,93 +121,49 @@ impl ViewPasses<'_> {
                 ("drawn", &scratch.drawn),
                 ("depth_keys", &scratch.by_depth.keys[0]),
                 ("tile_counts", &scratch.tile_counts),
+                ("slot_offsets", &scratch.slot_offsets),
+                ("block_slots", &scratch.block_slots),
             ],
         );
         let half = pipelines.sort.sort(gpu, passes, &scratch.by_depth, status, DEPTH_BITS);
-        let by_depth = &scratch.by_depth.values[half];
-        let counted = [
-            ("model", &splats.model),
-            ("by_depth", by_depth),
-            ("tile_counts", &scratch.tile_counts),
-            ("block_sums", &scratch.block_sums),
+        let by_depth = ("by_depth", &scratch.by_depth.values[half]);
+        let n_windows = u64::from(n_bins(size_px).div_ceil(512));
+        let listed = [view, model, capacity, by_depth, ("drawn", &scratch.drawn), ("bin_counts", &scratch.bin_counts)];
+        let tile_counts = ("tile_counts", &scratch.tile_counts);
+        passes.dispatch(gpu, &pipelines.count_bins, n_blocks * n_windows, &[&listed[..], &[tile_counts]].concat());
+        let bin_totals = ("bin_totals", &scratch.bin_totals);
+        passes.dispatch(
+            gpu,
+            &pipelines.scan_bins,
+            u64::from(n_bins(size_px)),
+            &[model, capacity, ("bin_counts", &scratch.bin_counts), bin_totals],
+        );
+        let starts = [bin_totals, ("bin_starts", &scratch.bin_starts), ("block_slots", &scratch.block_slots)];
+        let allocated = [&[view, model, capacity, ("status", status)], &starts[..]].concat();
+        passes.dispatch(gpu, &pipelines.allocate, 1, &allocated);
+        let written = [
+            tile_counts,
+            ("slot_offsets", &scratch.slot_offsets),
+            ("status", status),
+            ("entry_tiles", &scratch.entry_tiles),
+            ("entry_splats", &scratch.entry_splats),
+            ("entry_slots", &scratch.entry_slots),
         ];
-        passes.dispatch(gpu, &pipelines.count_blocks, n_blocks, &counted);
+        passes.dispatch(gpu, &pipelines.emit, n_blocks * n_windows, &[&listed[..], &starts, &written].concat());
         passes.dispatch(
             gpu,
-            &pipelines.scan_blocks,
-            1,
-            &[
-                ("model", &splats.model),
-                ("capacity", &scratch.capacity),
-                ("block_sums", &scratch.block_sums),
-                ("status", status),
-            ],
-        );
-        passes.dispatch(
-            gpu,
-            &pipelines.emit,
-            n_blocks,
-            &[
-                ("view", view),
-                ("model", &splats.model),
-                ("by_depth", by_depth),
-                ("tile_counts", &scratch.tile_counts),
-                ("drawn", &scratch.drawn),
-                ("block_sums", &scratch.block_sums),
-                ("status", status),
-                ("tile_keys", &scratch.by_tile.keys[0]),
-                ("slot_splats", &scratch.slot_splats),
-                ("slot_offsets", &scratch.slot_offsets),
-            ],
-        );
-        let half = pipelines.sort.sort(gpu, passes, &scratch.by_tile, status, scratch.n_tile_bits);
-        passes.clear(&frame.tile_ranges);
-        passes.dispatch(
-            gpu,
-            &pipelines.ranges,
-            u64::from(scratch.n_isect.div_ceil(1024)),
-            &[
-                ("view", view),
-                ("status", status),
-                ("tile_keys", &scratch.by_tile.keys[half]),
-                ("slots", &scratch.by_tile.values[half]),
-                ("slot_splats", &scratch.slot_splats),
-                ("tile_ranges", &frame.tile_ranges),
-                ("sorted_splats", &scratch.sorted_splats),
-            ],
-        );
-        if scratch.n_buckets > 0 {
-            passes.dispatch(
-                gpu,
-                &pipelines.bucket_offsets,
-                1,
-                &[
-                    ("view", view),
-                    ("capacity", &scratch.capacity),
-                    ("tile_ranges", &frame.tile_ranges),
-                    ("bucket_starts", &frame.bucket_starts),
-                    ("status", status),
-                ],
-            );
-        }
-        passes.dispatch(
-            gpu,
-            rasterize,
+            &pipelines.rasterize,
             u64::from(n_tiles(size_px)),
             &[
-                ("view", view),
+                view,
                 ("status", status),
-                ("tile_ranges", &frame.tile_ranges),
-                ("bucket_starts", &frame.bucket_starts),
-                ("sorted_splats", &scratch.sorted_splats),
+                ("bin_starts", &scratch.bin_starts),
+                ("entry_tiles", &scratch.entry_tiles),
+                ("entry_splats", &scratch.entry_splats),
                 ("drawn", &scratch.drawn),
                 ("image", &frame.image),
                 ("depth", &frame.depth),
                 ("last", &frame.last),
-                ("bucket_tiles", &scratch.bucket_tiles),
-                ("bucket_color", &scratch.bucket_color),
-                ("bucket_depth", &scratch.bucket_depth),
-                ("tile_last", &frame.tile_last),
             ],
         );
     }
@@ -262,25 +220,20 @@ impl ViewPasses<'_> {
     }
 
     /// Carries the slopes from the pixels to the intersections.
-    pub(crate) fn backward(&self, passes: &mut Passes, pipelines: &LearnPipelines, draw: &DrawPipelines) {
-        let Self { gpu, scratch, frame, status, view, .. } = *self;
-        let half = draw.sort.half_after(scratch.n_tile_bits);
+    pub(crate) fn backward(&self, passes: &mut Passes, pipelines: &LearnPipelines) {
+        let Self { gpu, scratch, frame, status, view, size_px, .. } = *self;
         passes.dispatch(
             gpu,
             &pipelines.backward,
-            u64::from(scratch.n_buckets),
+            u64::from(n_tiles(size_px)),
             &[
                 ("view", view),
                 ("status", status),
-                ("tile_ranges", &frame.tile_ranges),
-                ("bucket_starts", &frame.bucket_starts),
-                ("bucket_tiles", &scratch.bucket_tiles),
-                ("tile_last", &frame.tile_last),
-                ("sorted_splats", &scratch.sorted_splats),
-                ("slots", &scratch.by_tile.values[half]),
+                ("bin_starts", &scratch.bin_starts),
+                ("entry_tiles", &scratch.entry_tiles),
+                ("entry_splats", &scratch.entry_splats),
+                ("entry_slots", &scratch.entry_slots),
                 ("drawn", &scratch.drawn),
-                ("bucket_color", &scratch.bucket_color),
-                ("bucket_depth", &scratch.bucket_depth),
                 ("upstream", &frame.upstream),
                 ("rest", &frame.rest),
                 ("last", &frame.last),
@@ -302,6 +255,7 @@ impl ViewPasses<'_> {
                 ("rule", rule),
                 ("tile_counts", &scratch.tile_counts),
                 ("slot_offsets", &scratch.slot_offsets),
+                ("block_slots", &scratch.block_slots),
                 ("gradients", &scratch.gradients),
                 ("means", &splats.means),
                 ("rotations", &splats.rotations),

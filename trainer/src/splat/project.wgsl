@@ -1,8 +1,9 @@
 // project: place every splat on the image plane, color it, and count the tiles it touches.
 //
-// threads   one per splat
+// threads   256 per block of 256 splats
 // reads     view, model, means, rotations, shapes, sh_dc, sh_rest
-// writes    drawn [n_splats], depth_keys [n_splats] (24 bits; all ones where unseen), tile_counts [n_splats]
+// writes    drawn [n_splats], depth_keys [n_splats] (24 bits; all ones where unseen), tile_counts [n_splats],
+//           slot_offsets [n_splats] (within the block), block_slots [n_blocks] (intersections of the block)
 // twin      splat/reference/project.rs
 // source    Zwicker et al. 2001 (EWA volume splatting); Kerbl et al. 2023, section 4
 
@@ -11,6 +12,7 @@
 #import projection
 #import tiles
 #import sh
+#import scan
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> model: Model;
@@ -22,28 +24,27 @@
 @group(0) @binding(7) var<storage, read_write> drawn: array<Drawn>;
 @group(0) @binding(8) var<storage, read_write> depth_keys: array<u32>;
 @group(0) @binding(9) var<storage, read_write> tile_counts: array<u32>;
+@group(0) @binding(10) var<storage, read_write> slot_offsets: array<u32>;
+@group(0) @binding(11) var<storage, read_write> block_slots: array<u32>;
 
 const UNSEEN = 0xffffffu;
-override WG_SIZE = 256u;
-@compute @workgroup_size(WG_SIZE)
-fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
-    let splat_ix = folded(wg, n_wgs) * WG_SIZE + lane;
-    if splat_ix >= model.n_splats { return; } // Allowed here: no barrier, no subgroup operation below.
+
+// Places and colors a splat; says how many tiles it touches.
+fn draw(splat_ix: u32) -> u32 {
     let mean = means[splat_ix].xyz;
     let shape = shapes[splat_ix];
     let projection = project_splat(view, mean, rotations[splat_ix], shape.xyz);
     let opacity = sigmoid(shape.w);
     depth_keys[splat_ix] = UNSEEN;
-    tile_counts[splat_ix] = 0u;
     // Written so that a NaN anywhere is not seen.
     let seen = projection.seen && opacity > MIN_ALPHA && projection.determinant > 0.0 && inside_crop(view, mean)
         && abs(projection.mean_px.x) < 1e6 && abs(projection.mean_px.y) < 1e6 && projection.covariance.x + projection.covariance.z < 1e12;
-    if !seen { return; }
+    if !seen { return 0u; }
 
     let conic = vec3f(projection.covariance.z, -projection.covariance.y, projection.covariance.x) / projection.determinant;
     let reach = 2.0 * log(255.0 * opacity);
     let n_touched = n_tiles_touched(Ellipse(projection.mean_px, conic, reach), view.n_tiles);
-    if n_touched == 0u { return; }
+    if n_touched == 0u { return 0u; }
 
     let direction = normalize(mean - view.center_in_world.xyz);
     let basis = sh_basis(direction, model.sh_degree);
@@ -57,5 +58,20 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     // and sixteen octaves fit; what is further comes last, in the order of the splats.
     let beyond_near = bitcast<u32>(projection.point.z) - bitcast<u32>(view.shutter_linear.w);
     depth_keys[splat_ix] = min(beyond_near >> 3u, UNSEEN - 1u);
-    tile_counts[splat_ix] = n_touched;
+    return n_touched;
+}
+
+@compute @workgroup_size(256)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let block = folded(wg, n_wgs);
+    let splat_ix = block * 256u + lane;
+    var n_touched = 0u;
+    if splat_ix < model.n_splats { n_touched = draw(splat_ix); }
+    var total = 0u;
+    let offset = exclusive_scan(lane, n_touched, &total);
+    if splat_ix < model.n_splats {
+        tile_counts[splat_ix] = n_touched;
+        slot_offsets[splat_ix] = offset;
+        if lane == 0u { block_slots[block] = total; }
+    }
 }

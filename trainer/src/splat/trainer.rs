@@ -2,7 +2,7 @@
 #![expect(clippy::cast_possible_truncation, reason = "counts derived from caps that are u32, and bits of a seed")]
 
 use super::arrays::SplatArrays;
-use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_sh_rest, n_tiles};
+use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_sh_rest, n_bins, n_tiles};
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::options::SplatOptions;
 use super::params::{Camera, Growth, LOW_PASS_PX2, Rule, Supervision, status};
@@ -349,9 +349,9 @@ impl SplatTrainer {
             supervision: &self.supervision,
             ssim: self.options.dssim_frac > 0.0,
         };
-        view.draw(&mut self.passes, &self.draw, &learn.rasterize);
+        view.draw(&mut self.passes, &self.draw);
         view.compare(&mut self.passes, learn, &target);
-        view.backward(&mut self.passes, learn, &self.draw);
+        view.backward(&mut self.passes, learn);
         view.update(&mut self.passes, &learn.update, &self.rule);
         self.passes.dispatch(&self.gpu, &learn.advance, 1, &[("status", &self.learn_status)]);
         Ok(())
@@ -359,18 +359,17 @@ impl SplatTrainer {
 
     fn scratch_need(&self, size_px: [u32; 2], learn: bool) -> ScratchSize {
         let n_splats = self.splats.capacity;
-        let tiles = n_tiles(size_px);
-        let n_isect = (4 * n_splats).max(1 << 14);
-        ScratchSize { n_splats, n_isect, n_buckets: if learn { n_isect / 24 + tiles } else { 0 }, n_tiles: tiles }
+        let n_entries = (2 * n_splats).max(1 << 14);
+        ScratchSize { n_splats, n_entries, n_slots: if learn { 2 * n_entries } else { 0 }, n_bins: n_bins(size_px) }
     }
 
     fn ensure_scratch(&mut self, need: ScratchSize) -> Result<(), Error> {
         let have = self.scratch.as_ref().map(|(size, _)| *size);
         let fits = have.is_some_and(|have| {
             have.n_splats >= need.n_splats
-                && have.n_isect >= need.n_isect
-                && have.n_buckets >= need.n_buckets
-                && have.n_tiles >= need.n_tiles
+                && have.n_entries >= need.n_entries
+                && have.n_slots >= need.n_slots
+                && have.n_bins >= need.n_bins
         });
         if fits {
             return Ok(());
@@ -378,9 +377,9 @@ impl SplatTrainer {
         let have = have.unwrap_or(need);
         let size = ScratchSize {
             n_splats: need.n_splats.max(have.n_splats),
-            n_isect: need.n_isect.max(have.n_isect),
-            n_buckets: need.n_buckets.max(have.n_buckets),
-            n_tiles: need.n_tiles.max(have.n_tiles),
+            n_entries: need.n_entries.max(have.n_entries),
+            n_slots: need.n_slots.max(have.n_slots),
+            n_bins: need.n_bins.max(have.n_bins),
         };
         self.passes.submit(&self.gpu); // What is listed holds the old buffers.
         self.passes.forget_bindings();
@@ -397,8 +396,8 @@ impl SplatTrainer {
         let Some((size, _)) = self.scratch else { return Ok(false) };
         let larger = |need: u32, have: u32| if need > have { need.saturating_add(need / 2) } else { have };
         let need = ScratchSize {
-            n_isect: larger(counters[status::NEED_ISECT], size.n_isect),
-            n_buckets: larger(counters[status::NEED_BUCKETS], size.n_buckets),
+            n_entries: larger(counters[status::NEED_ENTRIES], size.n_entries),
+            n_slots: if size.n_slots == 0 { 0 } else { larger(counters[status::NEED_SLOTS], size.n_slots) },
             ..size
         };
         log::debug!("splat: intersections need {need:?}");
@@ -491,7 +490,7 @@ impl SplatTrainer {
                 view: &view,
                 size_px,
             };
-            passes.draw(&mut self.passes, &self.draw, &self.draw.rasterize);
+            passes.draw(&mut self.passes, &self.draw);
             passes.finish(&mut self.passes, &self.draw, &self.plain);
             self.passes.submit(&self.gpu);
             let counters: Vec<u32> = self.gpu.read(&self.draw_status, status::LEN)?;

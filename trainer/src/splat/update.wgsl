@@ -1,7 +1,7 @@
 // update: sum each splat's gradients over its intersections, carry them to its parameters, and take one Adam step.
 //
 // threads   one per splat
-// reads     view, model, rule, tile_counts, slot_offsets, gradients, status
+// reads     view, model, rule, tile_counts, slot_offsets, block_slots, gradients, status
 // writes    means, rotations, shapes, sh_dc, sh_rest and their moments, error_sums; or, with GRADIENTS_ONLY, the gradients
 //           themselves in place of the values, for tests
 // twin      splat/reference/project.rs, backward; optim/reference.rs
@@ -52,6 +52,7 @@ struct Rule {
 @group(0) @binding(13) var<storage, read_write> sh_rest_moments: array<vec2f>;
 @group(0) @binding(14) var<storage, read_write> status: array<atomic<u32>>;
 @group(0) @binding(15) var<storage, read_write> error_sums: array<f32>;        // since the last change of the splat count
+@group(0) @binding(16) var<storage, read> block_slots: array<u32>;
 
 override WG_SIZE = 256u;
 override GRADIENTS_ONLY: bool = false;
@@ -84,7 +85,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     if n_touched == 0u && rule.update_all == 0u && !GRADIENTS_ONLY { return; }
 
     var sum: Gradient;
-    let begin = slot_offsets[splat_ix];
+    let begin = block_slots[splat_ix / 256u] + slot_offsets[splat_ix];
     for (var slot = begin; slot < begin + n_touched; slot++) {
         let part = gradients[slot];
         sum.place += part.place;

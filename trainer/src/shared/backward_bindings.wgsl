@@ -1,0 +1,94 @@
+// backward_bindings: what both forms of `backward` read and write, and what they have in common.
+
+#import view
+#import model
+#import projection
+#import bins
+#import status
+#import gradient
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<storage, read> status: array<u32>;
+@group(0) @binding(2) var<storage, read> bin_starts: array<u32>;
+@group(0) @binding(3) var<storage, read> entry_tiles: array<u32>;
+@group(0) @binding(4) var<storage, read> entry_splats: array<u32>;
+@group(0) @binding(5) var<storage, read> entry_slots: array<u32>;
+@group(0) @binding(6) var<storage, read> drawn: array<Drawn>;
+@group(0) @binding(7) var<storage, read> upstream: array<vec4f>;
+@group(0) @binding(8) var<storage, read> rest: array<vec2f>;
+@group(0) @binding(9) var<storage, read> last: array<u32>;
+@group(0) @binding(10) var<storage, read_write> gradients: array<f32>; // 12 a slot, see `Gradient`
+
+const N_PARTS_OF_GRADIENT = 12u;
+
+// A lane's pixels: their slopes, and what lies around the splat at hand.
+struct Pixels {
+    v_red: Px,
+    v_green: Px,
+    v_blue: Px,
+    v_depth: Px,
+    error: Px,
+    last: PxU,
+    transmittance: Px, // in front of the splat at hand
+    behind: Px,        // what lies behind it, times its gradient
+}
+
+fn pixels_at(tile: Tile, first: vec2u) -> Pixels {
+    var out: Pixels;
+    out.transmittance = Px(1.0);
+    for (var k = 0u; k < PX; k++) {
+        if !tile.in_grid || first.x + k >= view.size_px.x || first.y >= view.size_px.y { continue; }
+        let at = first.y * view.size_px.x + first.x + k;
+        let slope = upstream[at];
+        let end = rest[at];
+        out.v_red[k] = slope.x;
+        out.v_green[k] = slope.y;
+        out.v_blue[k] = slope.z;
+        out.v_depth[k] = slope.w;
+        out.behind[k] = end.x;
+        out.error[k] = end.y;
+        out.last[k] = last[at];
+    }
+    return out;
+}
+
+// What a lane's pixels add to the gradient of the splat at hand, which then lies in front of them.
+//
+// Behind a splat lies `rest` minus what lies in front of it, so one number a pixel goes along beside the transmittance.
+fn passed(pixels: ptr<function, Pixels>, hit: PxB, power: Px, dx: Px, dy: f32, splat: Drawn) -> Gradient {
+    let falloff = select(Px(0.0), exp(-power), hit);
+    let unclamped = splat.place.w * falloff;
+    let alpha = min(Px(MAX_ALPHA), unclamped);
+    let weight = alpha * (*pixels).transmittance;
+    let value = splat.color.x * (*pixels).v_red + splat.color.y * (*pixels).v_green + splat.color.z * (*pixels).v_blue + splat.place.z * (*pixels).v_depth;
+    let behind = (*pixels).behind - weight * value;
+    let v_alpha = (*pixels).transmittance * value - behind / (1.0 - alpha);
+    let v_free = select(v_alpha, Px(0.0), unclamped > Px(MAX_ALPHA));
+    let v_power = -alpha * v_free;
+    (*pixels).transmittance *= 1.0 - alpha;
+    (*pixels).behind = behind;
+    let one = Px(1.0);
+    let v_dx = v_power * dx;
+    let v_0 = dot(v_power, one);
+    let v_x = dot(v_dx, one);
+    return Gradient(
+        vec4f(v_x, v_0 * dy, dot(weight, (*pixels).v_depth), dot(falloff, v_free)),
+        vec4f(dot(v_dx, dx), v_x * dy, v_0 * dy * dy, dot(weight, (*pixels).error)),
+        vec4f(dot(weight, (*pixels).v_red), dot(weight, (*pixels).v_green), dot(weight, (*pixels).v_blue), 0.0),
+    );
+}
+
+// From the sums of `passed` to the gradient.
+fn finished(sum: Gradient, conic: vec4f) -> Gradient {
+    let moved = sum.place.xy;
+    return Gradient(
+        vec4f(conic.x * moved.x + conic.y * moved.y, conic.y * moved.x + conic.z * moved.y, sum.place.zw),
+        vec4f(0.5 * sum.conic.x, sum.conic.y, 0.5 * sum.conic.z, sum.conic.w),
+        sum.color,
+    );
+}
+
+// Where the gradients of a tile's entry go.
+fn slot_of(entry: u32, tile_bit: u32) -> u32 {
+    return entry_slots[entry] + countOneBits(entry_tiles[entry] & (tile_bit - 1u));
+}

@@ -1,0 +1,43 @@
+// coverage: how a splat covers a lane's pixels. After `pixels`.
+
+// Half the squared distance in standard deviations; `offset` from pixel to splat.
+fn power_at(conic: vec4f, dx: Px, dy: f32) -> Px {
+    return 0.5 * (conic.x * dx * dx + conic.z * dy * dy) + conic.y * dy * dx;
+}
+
+fn within_reach(conic: vec4f, power: Px) -> PxB {
+    return (power >= Px(0.0)) & (power <= Px(0.5 * conic.w));
+}
+
+// A lane's pixels and what lies in front of the splat at hand.
+struct Blend {
+    red: Px,
+    green: Px,
+    blue: Px,
+    depth: Px,
+    transmittance: Px,
+    past_last: PxU,    // of the contributors, counted in the bin's list
+    live: PxB,
+}
+
+fn unblended(live: PxB) -> Blend {
+    return Blend(Px(0.0), Px(0.0), Px(0.0), Px(0.0), Px(1.0), PxU(0u), live);
+}
+
+// Blends in a splat where it reaches; `hit` is what it reaches, `rank` its place in the bin's list.
+fn blended(before: Blend, hit: PxB, power: Px, opacity_and_depth: vec2f, color: vec3f, rank: u32) -> Blend {
+    var after = before;
+    let alpha = min(Px(MAX_ALPHA), opacity_and_depth.x * exp(-power));
+    let next = before.transmittance * (1.0 - alpha);
+    let goes_on = next > Px(MIN_TRANSMITTANCE);
+    let adds = hit & goes_on;
+    let weight = select(Px(0.0), alpha * before.transmittance, adds);
+    after.red += weight * color.x;
+    after.green += weight * color.y;
+    after.blue += weight * color.z;
+    after.depth += weight * opacity_and_depth.y;
+    after.transmittance = select(before.transmittance, next, adds);
+    after.past_last = select(before.past_last, PxU(rank + 1u), adds);
+    after.live = before.live & (goes_on | !hit);
+    return after;
+}

@@ -1,0 +1,28 @@
+// rasterize_bindings: what both forms of `rasterize` read and write.
+
+#import view
+#import model
+#import projection
+#import bins
+#import status
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<storage, read> status: array<u32>;
+@group(0) @binding(2) var<storage, read> bin_starts: array<u32>;
+@group(0) @binding(3) var<storage, read> entry_tiles: array<u32>;
+@group(0) @binding(4) var<storage, read> entry_splats: array<u32>;
+@group(0) @binding(5) var<storage, read> drawn: array<Drawn>;
+@group(0) @binding(6) var<storage, read_write> image: array<vec4f>;
+@group(0) @binding(7) var<storage, read_write> depth: array<f32>;
+@group(0) @binding(8) var<storage, read_write> last: array<u32>;
+
+// Writes a lane's pixels, the first of them at `first`.
+fn write_pixels(first: vec2u, on_image: PxB, blend: Blend) {
+    for (var k = 0u; k < PX; k++) {
+        if !on_image[k] { continue; }
+        let at = first.y * view.size_px.x + first.x + k;
+        image[at] = vec4f(blend.red[k], blend.green[k], blend.blue[k], blend.transmittance[k]);
+        depth[at] = blend.depth[k];
+        last[at] = blend.past_last[k];
+    }
+}
