@@ -1,6 +1,7 @@
 //! The plain CPU version of the optimiser in f64.
 //!
-//! Source: Kingma and Ba 2015, algorithm 1, with both bias corrections.
+//! Source: Kingma and Ba 2015, algorithm 1, with both bias corrections; one second moment for several parameters as in
+//! Zhang et al. 2024 (Adam-mini).
 
 /// Constants of Adam.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -47,6 +48,16 @@ impl Adam {
         assert_eq!([rates.len(), gradients.len(), moments.len()], [params.len(); 3], "one of each per parameter");
         for (ix, param) in params.iter_mut().enumerate() {
             self.update(step, rates[ix], param, gradients[ix], &mut moments[ix]);
+        }
+    }
+
+    /// Moves parameters that share one running mean of the squared gradient, and have none of the gradient itself.
+    pub fn update_alike(&self, step: u32, rate: f64, params: &mut [f64], gradients: &[f64], second: &mut f64) {
+        let mean_square = gradients.iter().map(|gradient| gradient * gradient).sum::<f64>() / gradients.len() as f64;
+        *second = self.beta2 * *second + (1.0 - self.beta2) * mean_square;
+        let unbiased = *second / (1.0 - self.beta2.powf(f64::from(step)));
+        for (param, gradient) in params.iter_mut().zip(gradients) {
+            *param -= rate * gradient / (unbiased.sqrt() + self.epsilon);
         }
     }
 }

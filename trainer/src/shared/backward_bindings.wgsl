@@ -41,13 +41,13 @@ fn pixels_at(tile: Tile, first: vec2u) -> Pixels {
         let at = first.y * view.size_px.x + first.x + k;
         let slope = upstream[at];
         let end = rest[at];
-        out.v_red[k] = slope.x;
-        out.v_green[k] = slope.y;
-        out.v_blue[k] = slope.z;
-        out.v_depth[k] = slope.w;
-        out.behind[k] = end.x;
-        out.error[k] = end.y;
-        out.last[k] = last[at];
+        out.v_red = put(out.v_red, k, slope.x);
+        out.v_green = put(out.v_green, k, slope.y);
+        out.v_blue = put(out.v_blue, k, slope.z);
+        out.v_depth = put(out.v_depth, k, slope.w);
+        out.behind = put(out.behind, k, end.x);
+        out.error = put(out.error, k, end.y);
+        out.last = put_u(out.last, k, last[at]);
     }
     return out;
 }

@@ -7,7 +7,8 @@
 
 const BIN_TILES = 4u;
 const BLOCK = 256u;        // splats of a workgroup, neighbours in depth
-const WINDOW_BINS = 512u;  // bins a workgroup looks at
+const WINDOW_BINS = 256u;  // bins a workgroup looks at
+const GROUP = 32u;         // blocks whose counts are summed by one workgroup
 
 fn n_bins(n_tiles: vec2u) -> vec2u {
     return (n_tiles + vec2u(BIN_TILES - 1u)) / BIN_TILES;
@@ -20,15 +21,17 @@ struct BinRow {
 }
 
 fn bin_row(ellipse: Ellipse, row: i32, tile_rows: vec2i, n_tiles: vec2u) -> BinRow {
-    var out: BinRow;
-    for (var i = 0; i < 4; i++) {
-        let tile_row = row * 4 + i;
-        if tile_row < tile_rows.x || tile_row >= tile_rows.y { continue; }
-        let columns = tile_columns(ellipse, tile_row, n_tiles);
-        out.begin[i] = columns.x;
-        out.end[i] = columns.y;
-    }
-    return out;
+    // Four by name: indexing by a variable would put them into memory.
+    let a = columns_of_row(ellipse, row * 4, tile_rows, n_tiles);
+    let b = columns_of_row(ellipse, row * 4 + 1, tile_rows, n_tiles);
+    let c = columns_of_row(ellipse, row * 4 + 2, tile_rows, n_tiles);
+    let d = columns_of_row(ellipse, row * 4 + 3, tile_rows, n_tiles);
+    return BinRow(vec4i(a.x, b.x, c.x, d.x), vec4i(a.y, b.y, c.y, d.y));
+}
+
+fn columns_of_row(ellipse: Ellipse, row: i32, tile_rows: vec2i, n_tiles: vec2u) -> vec2i {
+    if row < tile_rows.x || row >= tile_rows.y { return vec2i(0); }
+    return tile_columns(ellipse, row, n_tiles);
 }
 
 // First and past-the-last column of bins.

@@ -2,12 +2,13 @@
 // bindings it uses.
 
 const WORDS = BLOCK / 32u;
-var<workgroup> wg_reaching: array<atomic<u32>, 4096>; // [WINDOW_BINS, WORDS]
+var<workgroup> wg_reaching: array<atomic<u32>, 2048>; // [WINDOW_BINS, WORDS]
 
 struct BlockAndWindow {
     block: u32,
     first_bin: u32,
     n_bins: u32,       // of the window
+    row: u32,          // of the window's first bin in bin_counts
 }
 
 fn n_blocks_in_use() -> u32 {
@@ -18,7 +19,8 @@ fn block_and_window(group: u32) -> BlockAndWindow {
     let bins = n_bins(view.n_tiles);
     let n_windows = (bins.x * bins.y + WINDOW_BINS - 1u) / WINDOW_BINS;
     let first_bin = (group % n_windows) * WINDOW_BINS;
-    return BlockAndWindow(group / n_windows, first_bin, min(bins.x * bins.y - first_bin, WINDOW_BINS));
+    let block = group / n_windows;
+    return BlockAndWindow(block, first_bin, min(bins.x * bins.y - first_bin, WINDOW_BINS), block * bins.x * bins.y + first_bin);
 }
 
 // The splat of a lane and its ellipse; one that is not drawn reaches nothing.

@@ -3,6 +3,5 @@
 struct Capacity {
     n_entries: u32,    // of the bins' lists
     n_slots: u32,      // gradients of intersections; 0: nothing is learned, and they need no memory
-    n_blocks: u32,     // blocks of 256 splats
-    unused: u32,
+    unused: vec2u,
 }

@@ -19,10 +19,10 @@
 // Writes a lane's pixels, the first of them at `first`.
 fn write_pixels(first: vec2u, on_image: PxB, blend: Blend) {
     for (var k = 0u; k < PX; k++) {
-        if !on_image[k] { continue; }
+        if !any(on_image & (INDEX == PxU(k))) { continue; }
         let at = first.y * view.size_px.x + first.x + k;
-        image[at] = vec4f(blend.red[k], blend.green[k], blend.blue[k], blend.transmittance[k]);
-        depth[at] = blend.depth[k];
-        last[at] = blend.past_last[k];
+        image[at] = vec4f(pick(blend.red, k), pick(blend.green, k), pick(blend.blue, k), pick(blend.transmittance, k));
+        depth[at] = pick(blend.depth, k);
+        last[at] = pick_u(blend.past_last, k);
     }
 }

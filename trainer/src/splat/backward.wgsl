@@ -1,6 +1,6 @@
 // backward: the gradient of every intersection of splat and tile.
 //
-// threads   128 per tile, two pixels a lane
+// threads   32 per tile, two pixels in each of its quarters a lane
 // reads     view, status, bin_starts, entry_tiles, entry_splats, entry_slots, drawn, upstream [n_pixels] (slope towards rgb
 //           and depth), rest [n_pixels] (color . v_color + depth v_depth + transmittance v_transmittance of the finished
 //           pixel; y: absolute error), last
@@ -9,8 +9,7 @@
 // source    Kerbl et al. 2023, appendix A
 //
 // The splats pass front to back, as they were blended, over lanes that keep the state of their pixels: nothing is stored
-// between the two kernels but `last`. A splat's sums over the pixels meet in a fixed order: within a subgroup by shuffles
-// (`sums`), then over the subgroups in order.
+// between the two kernels but `last`. A splat's sums over the pixels meet in a fixed order (`sums`).
 
 #import backward_bindings
 #import pixels
@@ -19,73 +18,69 @@
 #import tile_queue
 #import sums
 
-const BATCH = 64u;
-var<workgroup> wg_drawn: array<Drawn, BATCH>;
 var<workgroup> wg_tile: Tile;
 var<workgroup> wg_past_last: atomic<u32>;
 var<workgroup> wg_past: u32;
+var<workgroup> wg_slots: array<u32, BATCH>;
 
-// Writes nothing but zeros: these splats are hidden in this tile.
-fn hide(lane: u32, batch: u32, n: u32, tile_bit: u32) {
-    for (var i = lane; i < n * N_PARTS_OF_GRADIENT; i += LANES) {
-        let slot = slot_of(wg_queue[batch + i / N_PARTS_OF_GRADIENT], tile_bit);
-        gradients[slot * N_PARTS_OF_GRADIENT + i % N_PARTS_OF_GRADIENT] = 0.0;
+fn pass_over(pixels: ptr<function, Pixels>, sum: ptr<function, Gradient>, splat: Drawn, dx: Px, dy: f32) {
+    let power = power_at(splat.conic, dx, dy);
+    let hit = (PxU(bitcast<u32>(splat.color.w)) < (*pixels).last) & within_reach(splat.conic, power);
+    if any(hit) {
+        let part = passed(pixels, hit, power, dx, dy, splat);
+        (*sum).place += part.place;
+        (*sum).conic += part.conic;
+        (*sum).color += part.color;
     }
 }
 
-fn backward(wg_ix: u32, lane: u32) {
+fn most_of(last: PxU) -> u32 {
+    return max(pick_u(last, 0u), pick_u(last, 1u));
+}
+
+fn backward(tile_ix: u32, lane: u32) {
     if lane == 0u {
-        wg_tile = tile_at(wg_ix);
+        wg_tile = tile_at(tile_ix);
         atomicStore(&wg_past_last, 0u);
     }
     let tile = workgroupUniformLoad(&wg_tile); // Also orders the zeroing before anyone raises it.
     let first = tile.corner + lane_px(lane);
     let center_x = f32(first.x) + 0.5 + RAMP;
     let center_y = f32(first.y) + 0.5;
-    var pixels = pixels_at(tile, first);
-    for (var k = 0u; k < PX; k++) { atomicMax(&wg_past_last, pixels.last[k]); }
+    // Four by name and not an array: what is indexed by a variable lies in memory.
+    var a = pixels_at(tile, first);
+    var b = pixels_at(tile, first + vec2u(8u, 0u));
+    var c = pixels_at(tile, first + vec2u(0u, 8u));
+    var d = pixels_at(tile, first + vec2u(8u, 8u));
+    atomicMax(&wg_past_last, max(max(most_of(a.last), most_of(b.last)), max(most_of(c.last), most_of(d.last))));
     workgroupBarrier(); // All have told their last.
     if lane == 0u { wg_past = atomicLoad(&wg_past_last); }
     let past_last = workgroupUniformLoad(&wg_past);
     for (var chunk = tile.begin; chunk < tile.end; chunk += CHUNK) {
-        let n_queued = queue_chunk(lane, chunk, tile.end, tile.bit);
+        let n_queued = queue_chunk(lane, chunk, tile);
         for (var batch = 0u; batch < n_queued; batch += BATCH) {
+            workgroupBarrier(); // Nobody reads the last batch's slots any more.
+            if batch + lane < n_queued { wg_slots[lane] = slot_of(wg_queue[batch + lane], tile.bit); }
+            take_batch(lane, batch, n_queued, tile);
             let n = min(n_queued - batch, BATCH);
-            if wg_queue[batch] - tile.begin >= past_last {
-                hide(lane, batch, n_queued - batch, tile.bit);
-                break;
-            }
-            workgroupBarrier(); // All have read the last batch.
-            if lane < 16u { atomicStore(&wg_touching[lane], 0u); }
-            workgroupBarrier(); // All bits are zero before the first is set.
-            if lane < n {
-                let entry = wg_queue[batch + lane];
-                var splat = drawn[entry_splats[entry]];
-                splat.color.w = bitcast<f32>(entry - tile.begin);
-                wg_drawn[lane] = splat;
-                if entry - tile.begin < past_last { mark_quarters(lane, splat, tile.corner); }
-            }
-            workgroupBarrier(); // The batch is there before anyone reads it.
-            for (var word = 0u; word < BATCH / 32u; word++) {
-                var bits = shared_bits(lane, word);
-                while bits != 0u {
-                    let i = word * 32u + firstTrailingBit(bits);
-                    bits &= bits - 1u;
-                    let splat = wg_drawn[i];
-                    let dx = splat.place.x - center_x;
-                    let dy = splat.place.y - center_y;
-                    let power = power_at(splat.conic, dx, dy);
-                    let hit = (PxU(bitcast<u32>(splat.color.w)) < pixels.last) & within_reach(splat.conic, power);
-                    var sum: Gradient;
-                    if anyone(any(hit)) { sum = finished(passed(&pixels, hit, power, dx, dy, splat), splat.conic); }
-                    hand_in(lane, i, sum);
+            if bitcast<u32>(wg_drawn[0].color.w) >= past_last {
+                // All of them are hidden in this tile.
+                for (var at = lane; at < n * N_PARTS_OF_GRADIENT; at += LANES) {
+                    gradients[wg_slots[at / N_PARTS_OF_GRADIENT] * N_PARTS_OF_GRADIENT + at % N_PARTS_OF_GRADIENT] = 0.0;
                 }
+                continue;
             }
-            workgroupBarrier(); // All parts of the sums are there.
-            for (var at = lane; at < n * N_PARTS_OF_GRADIENT; at += LANES) {
-                let i = at / N_PARTS_OF_GRADIENT;
-                let slot = slot_of(wg_queue[batch + i], tile.bit);
-                gradients[slot * N_PARTS_OF_GRADIENT + at % N_PARTS_OF_GRADIENT] = sum_of_parts(i, at % N_PARTS_OF_GRADIENT);
+            for (var i = 0u; i < n; i++) {
+                let splat = wg_drawn[i];
+                let quarters = wg_quarters[i];
+                let dx = splat.place.x - center_x;
+                let dy = splat.place.y - center_y;
+                var sum: Gradient;
+                if (quarters & 1u) != 0u { pass_over(&a, &sum, splat, dx, dy); }
+                if (quarters & 2u) != 0u { pass_over(&b, &sum, splat, dx - 8.0, dy); }
+                if (quarters & 4u) != 0u { pass_over(&c, &sum, splat, dx, dy - 8.0); }
+                if (quarters & 8u) != 0u { pass_over(&d, &sum, splat, dx - 8.0, dy - 8.0); }
+                hand_in(lane, wg_slots[i], finished(sum, splat.conic));
             }
         }
     }

@@ -10,6 +10,11 @@ use crate::sort::SortBuffers;
 /// Bits of a depth key, as in project.wgsl.
 pub(crate) const DEPTH_BITS: u32 = 24;
 
+/// Splats of a block, neighbours in depth; bins a workgroup looks at; blocks of a group: as in shared/bins.wgsl.
+pub(crate) const BLOCK: u32 = 256;
+pub(crate) const WINDOW_BINS: u32 = 256;
+pub(crate) const GROUP: u32 = 32;
+
 /// Floats of the spherical harmonics past the constant one.
 pub(crate) fn n_sh_rest(sh_degree: u32) -> u32 {
     3 * ((sh_degree + 1) * (sh_degree + 1) - 1)
@@ -54,7 +59,7 @@ impl SplatBuffers {
             sh_rest: gpu.storage("splat.sh_rest", 4 * rest * n)?,
             moments: gpu.storage("splat.moments", 96 * n)?,
             sh_dc_moments: gpu.storage("splat.sh_dc_moments", 24 * n)?,
-            sh_rest_moments: gpu.storage("splat.sh_rest_moments", 8 * rest * n)?,
+            sh_rest_moments: gpu.storage("splat.sh_rest_moments", 4 * n)?,
             error_sums: gpu.storage("splat.error_sums", 4 * n)?,
         })
     }
@@ -180,7 +185,7 @@ impl SplatBuffers {
             (&self.sh_rest, rest, 4),
             (&self.moments, 6, 16),
             (&self.sh_dc_moments, 3, 8),
-            (&self.sh_rest_moments, rest, 8),
+            (&self.sh_rest_moments, 1, 4),
             (&self.error_sums, 1, 4),
         ]
     }
@@ -196,6 +201,7 @@ pub(crate) struct Scratch {
     pub(crate) block_slots: Buffer,
     pub(crate) by_depth: SortBuffers,
     pub(crate) bin_counts: Buffer,
+    pub(crate) group_counts: Buffer,
     pub(crate) bin_totals: Buffer,
     pub(crate) bin_starts: Buffer,
     pub(crate) entry_tiles: Buffer,
@@ -218,16 +224,18 @@ pub(crate) struct ScratchSize {
 impl Scratch {
     pub(crate) fn new(gpu: &Gpu, pipelines: &DrawPipelines, size: ScratchSize) -> Result<Self, Error> {
         let words = |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n.max(1)));
-        let n_blocks = size.n_splats.div_ceil(256);
         let ScratchSize { n_splats, n_entries, n_slots, n_bins } = size;
+        let n_blocks = n_splats.div_ceil(BLOCK);
+        let per_bin = |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n_bins) * u64::from(n.max(1)));
         Ok(Self {
-            capacity: gpu.uniform_with("splat.capacity", &Capacity { n_entries, n_slots, n_blocks, unused: 0 }),
+            capacity: gpu.uniform_with("splat.capacity", &Capacity { n_entries, n_slots, unused: [0; 2] }),
             drawn: gpu.storage("splat.drawn", 48 * u64::from(n_splats))?,
             tile_counts: words("splat.tile_counts", n_splats)?,
             slot_offsets: words("splat.slot_offsets", n_splats)?,
             block_slots: words("splat.block_slots", n_blocks)?,
             by_depth: pipelines.sort.buffers(gpu, "splat.by_depth", n_splats, DEPTH_BITS, status::N_SPLATS)?,
-            bin_counts: gpu.storage("splat.bin_counts", 4 * u64::from(n_bins) * u64::from(n_blocks.max(1)))?,
+            bin_counts: per_bin("splat.bin_counts", n_blocks)?,
+            group_counts: per_bin("splat.group_counts", n_blocks.div_ceil(GROUP))?,
             bin_totals: words("splat.bin_totals", n_bins)?,
             bin_starts: words("splat.bin_starts", n_bins + 1)?,
             entry_tiles: words("splat.entry_tiles", n_entries)?,

@@ -21,7 +21,7 @@
 @group(0) @binding(7) var<storage, read_write> sh_rest: array<f32>;
 @group(0) @binding(8) var<storage, read_write> moments: array<vec4f>;
 @group(0) @binding(9) var<storage, read_write> sh_dc_moments: array<vec2f>;
-@group(0) @binding(10) var<storage, read_write> sh_rest_moments: array<vec2f>;
+@group(0) @binding(10) var<storage, read_write> sh_rest_moments: array<f32>;
 @group(0) @binding(11) var<storage, read_write> n_children: array<atomic<u32>>;
 @group(0) @binding(12) var<storage, read_write> parents: array<u32>;
 
@@ -75,6 +75,6 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     }
     for (var plane = 0u; plane < growth.n_sh_rest; plane++) {
         sh_rest[plane * growth.capacity + child] = sh_rest[plane * growth.capacity + parent];
-        sh_rest_moments[plane * growth.capacity + child] = vec2f(0.0);
     }
+    sh_rest_moments[child] = 0.0;
 }

@@ -104,6 +104,7 @@ fn blend(gpu: &Gpu) -> Blend {
 pub const KERNELS: &[Kernel] = &[
     kernel!("project"),
     kernel!("count_bins"),
+    kernel!("sum_bins"),
     kernel!("scan_bins"),
     kernel!("allocate"),
     kernel!("emit"),
@@ -129,6 +130,7 @@ pub(crate) struct DrawPipelines {
     pub(crate) sort: RadixSort,
     pub(crate) project: Pipeline,
     pub(crate) count_bins: Pipeline,
+    pub(crate) sum_bins: Pipeline,
     pub(crate) scan_bins: Pipeline,
     pub(crate) allocate: Pipeline,
     pub(crate) emit: Pipeline,
@@ -142,6 +144,7 @@ impl DrawPipelines {
             sort: RadixSort::new(gpu)?,
             project: Pipeline::new(gpu, kernel!("project"), &[])?,
             count_bins: Pipeline::new(gpu, kernel!("count_bins"), &[])?,
+            sum_bins: Pipeline::new(gpu, kernel!("sum_bins"), &[])?,
             scan_bins: Pipeline::new(gpu, kernel!("scan_bins"), &[])?,
             allocate: Pipeline::new(gpu, kernel!("allocate"), &[])?,
             emit: Pipeline::new(gpu, kernel!("emit"), &[])?,
@@ -268,7 +271,7 @@ mod tests {
         );
         assert_layout!(Supervision, [background_srgb, dssim_frac, depth_weight, depth_clip_m, varied_background]);
         assert_layout!(Growth, [n_before, n_after, key, capacity, n_sh_rest, child_spread, least_opacity, unused]);
-        assert_layout!(Capacity, [n_entries, n_slots, n_blocks, unused]);
+        assert_layout!(Capacity, [n_entries, n_slots, unused]);
     }
 
     #[test]

@@ -113,8 +113,7 @@ pub(crate) struct Model {
 pub(crate) struct Capacity {
     pub(crate) n_entries: u32,
     pub(crate) n_slots: u32,
-    pub(crate) n_blocks: u32,
-    pub(crate) unused: u32,
+    pub(crate) unused: [u32; 2],
 }
 
 /// `Rule` of update.wgsl: how parameters learn.

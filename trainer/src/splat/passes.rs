@@ -1,6 +1,6 @@
 //! The stages of drawing and learning, as lists of passes.
 
-use super::buffers::{DEPTH_BITS, Frame, Scratch, SplatBuffers, n_bins, n_tiles};
+use super::buffers::{BLOCK, DEPTH_BITS, Frame, GROUP, Scratch, SplatBuffers, WINDOW_BINS, n_bins, n_tiles};
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::params::Growth;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
@@ -103,9 +103,8 @@ impl ViewPasses<'_> {
     /// Projects, sorts, bins and rasterizes.
     pub(crate) fn draw(&self, passes: &mut Passes, pipelines: &DrawPipelines) {
         let Self { gpu, splats, scratch, frame, status, view, size_px } = *self;
-        let n_blocks = u64::from(splats.n_splats.div_ceil(256));
-        let (model, capacity) = (("model", &splats.model), ("capacity", &scratch.capacity));
-        let view = ("view", view);
+        let n_blocks = u64::from(splats.n_splats.div_ceil(BLOCK));
+        let [view, model] = [("view", view), ("model", &splats.model)];
         passes.dispatch(
             gpu,
             &pipelines.project,
@@ -127,40 +126,47 @@ impl ViewPasses<'_> {
         );
         let half = pipelines.sort.sort(gpu, passes, &scratch.by_depth, status, DEPTH_BITS);
         let by_depth = ("by_depth", &scratch.by_depth.values[half]);
-        let n_windows = u64::from(n_bins(size_px).div_ceil(512));
-        let listed = [view, model, capacity, by_depth, ("drawn", &scratch.drawn), ("bin_counts", &scratch.bin_counts)];
-        let tile_counts = ("tile_counts", &scratch.tile_counts);
-        passes.dispatch(gpu, &pipelines.count_bins, n_blocks * n_windows, &[&listed[..], &[tile_counts]].concat());
-        let bin_totals = ("bin_totals", &scratch.bin_totals);
-        passes.dispatch(
-            gpu,
-            &pipelines.scan_bins,
-            u64::from(n_bins(size_px)),
-            &[model, capacity, ("bin_counts", &scratch.bin_counts), bin_totals],
-        );
-        let starts = [bin_totals, ("bin_starts", &scratch.bin_starts), ("block_slots", &scratch.block_slots)];
-        let allocated = [&[view, model, capacity, ("status", status)], &starts[..]].concat();
+        let n_windows = u64::from(n_bins(size_px).div_ceil(WINDOW_BINS));
+        let [drawn, tile_counts] = [("drawn", &scratch.drawn), ("tile_counts", &scratch.tile_counts)];
+        let [bin_counts, group_counts] = [("bin_counts", &scratch.bin_counts), ("group_counts", &scratch.group_counts)];
+        let [bin_totals, bin_starts] = [("bin_totals", &scratch.bin_totals), ("bin_starts", &scratch.bin_starts)];
+        let [block_slots, status] = [("block_slots", &scratch.block_slots), ("status", status)];
+        let counted = [view, model, by_depth, tile_counts, drawn, bin_counts];
+        passes.dispatch(gpu, &pipelines.count_bins, n_blocks * n_windows, &counted);
+        let n_groups = n_blocks.div_ceil(u64::from(GROUP));
+        passes.dispatch(gpu, &pipelines.sum_bins, n_groups * n_windows, &[view, model, bin_counts, group_counts]);
+        let scanned = [view, model, group_counts, bin_totals];
+        passes.dispatch(gpu, &pipelines.scan_bins, u64::from(n_bins(size_px)), &scanned);
+        let allocated = [view, model, ("capacity", &scratch.capacity), bin_totals, bin_starts, block_slots, status];
         passes.dispatch(gpu, &pipelines.allocate, 1, &allocated);
-        let written = [
-            tile_counts,
+        let emitted = [
+            view,
+            model,
+            group_counts,
+            by_depth,
+            drawn,
+            bin_counts,
+            bin_starts,
             ("slot_offsets", &scratch.slot_offsets),
-            ("status", status),
+            block_slots,
+            status,
+            tile_counts,
             ("entry_tiles", &scratch.entry_tiles),
             ("entry_splats", &scratch.entry_splats),
             ("entry_slots", &scratch.entry_slots),
         ];
-        passes.dispatch(gpu, &pipelines.emit, n_blocks * n_windows, &[&listed[..], &starts, &written].concat());
+        passes.dispatch(gpu, &pipelines.emit, n_blocks * n_windows, &emitted);
         passes.dispatch(
             gpu,
             &pipelines.rasterize,
             u64::from(n_tiles(size_px)),
             &[
                 view,
-                ("status", status),
-                ("bin_starts", &scratch.bin_starts),
+                status,
+                bin_starts,
                 ("entry_tiles", &scratch.entry_tiles),
                 ("entry_splats", &scratch.entry_splats),
-                ("drawn", &scratch.drawn),
+                drawn,
                 ("image", &frame.image),
                 ("depth", &frame.depth),
                 ("last", &frame.last),
@@ -267,6 +273,7 @@ impl ViewPasses<'_> {
                 ("sh_rest_moments", &splats.sh_rest_moments),
                 ("status", status),
                 ("error_sums", &splats.error_sums),
+                ("drawn", &scratch.drawn),
             ],
         );
     }

@@ -29,6 +29,16 @@
 
 const UNSEEN = 0xffffffu;
 
+struct ShSums {
+    splat_ix: u32,
+    color: vec3f,
+}
+
+fn sh_term(sums: ptr<function, ShSums>, k: u32, basis: f32, slope: vec3f) {
+    let at = 3u * k * model.capacity + (*sums).splat_ix;
+    (*sums).color += basis * vec3f(sh_rest[at], sh_rest[at + model.capacity], sh_rest[at + 2u * model.capacity]);
+}
+
 // Places and colors a splat; says how many tiles it touches.
 fn draw(splat_ix: u32) -> u32 {
     let mean = means[splat_ix].xyz;
@@ -46,14 +56,11 @@ fn draw(splat_ix: u32) -> u32 {
     let n_touched = n_tiles_touched(Ellipse(projection.mean_px, conic, reach), view.n_tiles);
     if n_touched == 0u { return 0u; }
 
-    let direction = normalize(mean - view.center_in_world.xyz);
-    let basis = sh_basis(direction, model.sh_degree);
-    var color = vec3f(0.5) + SH_0 * vec3f(sh_dc[splat_ix], sh_dc[model.capacity + splat_ix], sh_dc[2u * model.capacity + splat_ix]);
-    for (var plane = 0u; plane < model.n_sh_rest; plane += 3u) {
-        let at = plane * model.capacity + splat_ix;
-        color += basis[plane / 3u] * vec3f(sh_rest[at], sh_rest[at + model.capacity], sh_rest[at + 2u * model.capacity]);
-    }
-    drawn[splat_ix] = Drawn(vec4f(projection.mean_px, projection.point.z, opacity), vec4f(conic, reach), vec4f(max(color, vec3f(0.0)), 0.0));
+    let constant = vec3f(sh_dc[splat_ix], sh_dc[model.capacity + splat_ix], sh_dc[2u * model.capacity + splat_ix]);
+    var sums = ShSums(splat_ix, vec3f(0.5) + SH_0 * constant);
+    each_sh(&sums, normalize(mean - view.center_in_world.xyz), model.sh_degree);
+    let color = max(sums.color, vec3f(0.0));
+    drawn[splat_ix] = Drawn(vec4f(projection.mean_px, projection.point.z, opacity), vec4f(conic, reach), vec4f(color, 0.0));
     // Positive floats order as their bits do. Counted from the near plane, without the last three, a millionth of the depth
     // and sixteen octaves fit; what is further comes last, in the order of the splats.
     let beyond_near = bitcast<u32>(projection.point.z) - bitcast<u32>(view.shutter_linear.w);

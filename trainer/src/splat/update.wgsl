@@ -1,11 +1,16 @@
 // update: sum each splat's gradients over its intersections, carry them to its parameters, and take one Adam step.
 //
 // threads   one per splat
-// reads     view, model, rule, tile_counts, slot_offsets, block_slots, gradients, status
-// writes    means, rotations, shapes, sh_dc, sh_rest and their moments, error_sums; or, with GRADIENTS_ONLY, the gradients
+// reads     view, model, rule, drawn, tile_counts, slot_offsets, block_slots, gradients, status
+// writes    means, rotations, shapes, sh_dc, sh_rest, their moments, error_sums; or, with GRADIENTS_ONLY, the gradients
 //           themselves in place of the values, for tests
 // twin      splat/reference/project.rs, backward; optim/reference.rs
-// source    Kerbl et al. 2023, appendix A; Kingma and Ba 2015; noise of Kheradmand et al. 2024 (3DGS-MCMC), section 4.1
+// source    Kerbl et al. 2023, appendix A; Kingma and Ba 2015; noise of Kheradmand et al. 2024 (3DGS-MCMC), section 4.1;
+//           one second moment for many values as in Adam-mini (Zhang et al. 2024)
+//
+// The functions past the constant one share one second moment a splat and have no first: the squares of a degree's basis
+// functions sum to the same in every direction, so the mean square of their slopes is |v_color|^2 / (12 pi), and their rate
+// is so small that the mean over steps is taken by the parameters themselves.
 
 #import view
 #import model
@@ -49,13 +54,15 @@ struct Rule {
 @group(0) @binding(10) var<storage, read_write> sh_rest: array<f32>;
 @group(0) @binding(11) var<storage, read_write> moments: array<vec4f>;         // planes: first and second of means, rotations, shapes
 @group(0) @binding(12) var<storage, read_write> sh_dc_moments: array<vec2f>;   // first and second
-@group(0) @binding(13) var<storage, read_write> sh_rest_moments: array<vec2f>;
+@group(0) @binding(13) var<storage, read_write> sh_rest_moments: array<f32>;     // second, shared
 @group(0) @binding(14) var<storage, read_write> status: array<atomic<u32>>;
 @group(0) @binding(15) var<storage, read_write> error_sums: array<f32>;        // since the last change of the splat count
 @group(0) @binding(16) var<storage, read> block_slots: array<u32>;
+@group(0) @binding(17) var<storage, read> drawn: array<Drawn>;
 
 override WG_SIZE = 256u;
 override GRADIENTS_ONLY: bool = false;
+const PI = 3.14159265358979;
 var<private> correction: vec2f;   // 1 / (1 - beta^t)
 
 fn adam4(plane: u32, splat_ix: u32, gradient: vec4f) -> vec4f {
@@ -74,6 +81,24 @@ fn adam1(moment: ptr<function, vec2f>, gradient: f32) -> f32 {
 
 fn finite(x: vec4f) -> bool {
     return all((bitcast<vec4u>(x) & vec4u(0x7f800000u)) != vec4u(0x7f800000u));
+}
+
+struct ShSums {
+    splat_ix: u32,
+    v_color: vec3f,
+    pull: vec3f,       // per value of the basis function
+    v_direction: vec3f,
+}
+
+fn sh_term(sums: ptr<function, ShSums>, k: u32, basis: f32, slope: vec3f) {
+    let at = 3u * k * model.capacity + (*sums).splat_ix;
+    let rest = vec3f(sh_rest[at], sh_rest[at + model.capacity], sh_rest[at + 2u * model.capacity]);
+    (*sums).v_direction += slope * dot((*sums).v_color, rest);
+    var moved = rest - basis * (*sums).pull;
+    if GRADIENTS_ONLY { moved = basis * (*sums).v_color; }
+    sh_rest[at] = moved.x;
+    sh_rest[at + model.capacity] = moved.y;
+    sh_rest[at + 2u * model.capacity] = moved.z;
 }
 
 @compute @workgroup_size(WG_SIZE)
@@ -149,42 +174,33 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         v_mean = view.camera_row_0.xyz * v_still.x + view.camera_row_1.xyz * v_still.y + view.camera_row_2.xyz * v_still.z;
     }
 
-    // Color: recomputed for its clamp at 0, and for the gradient through the direction.
+    let v_color = select(vec3f(0.0), sum.color.rgb, drawn[splat_ix].color.rgb > vec3f(0.0)); // Drawn colors end at 0.
+    if !GRADIENTS_ONLY && (!finite(vec4f(v_mean, v_opacity_logit)) || !finite(v_rotation) || !finite(vec4f(v_log_scale, sum.conic.w)) || !finite(vec4f(v_color, 0.0))) {
+        atomicAdd(&status[N_POISONED], 1u);
+        return;
+    }
+    let step = f32(atomicLoad(&status[STEP]));
+    correction = 1.0 / (1.0 - pow(rule.betas, vec2f(step + 1.0)));
+
+    let mean_square = mix(dot(v_color, v_color) / (12.0 * PI), sh_rest_moments[splat_ix], rule.betas.y);
+    let pull = rule.sh_rest_rate * v_color / (sqrt(mean_square * correction.y) + rule.epsilon);
     let to_splat = mean - view.center_in_world.xyz;
     let distance = max(length(to_splat), 1e-6);
     let direction = to_splat / distance;
-    let basis = sh_basis(direction, model.sh_degree);
-    let slopes = sh_basis_gradient(direction, model.sh_degree);
-    let capacity = model.capacity;
-    var color = vec3f(0.5) + SH_0 * vec3f(sh_dc[splat_ix], sh_dc[capacity + splat_ix], sh_dc[2u * capacity + splat_ix]);
-    for (var plane = 0u; plane < model.n_sh_rest; plane += 3u) {
-        let at = plane * capacity + splat_ix;
-        color += basis[plane / 3u] * vec3f(sh_rest[at], sh_rest[at + capacity], sh_rest[at + 2u * capacity]);
-    }
-    let v_color = select(vec3f(0.0), sum.color.rgb, color > vec3f(0.0));
-    var v_direction = vec3f(0.0);
-    for (var plane = 0u; plane < model.n_sh_rest; plane += 3u) {
-        let at = plane * capacity + splat_ix;
-        v_direction += slopes[plane / 3u] * dot(v_color, vec3f(sh_rest[at], sh_rest[at + capacity], sh_rest[at + 2u * capacity]));
-    }
-    v_mean += (v_direction - direction * dot(direction, v_direction)) / distance;
+    var sh = ShSums(splat_ix, v_color, pull, vec3f(0.0));
+    each_sh(&sh, direction, model.sh_degree);
+    v_mean += (sh.v_direction - direction * dot(direction, sh.v_direction)) / distance;
 
+    let capacity = model.capacity;
     if GRADIENTS_ONLY {
         means[splat_ix] = vec4f(v_mean, 0.0);
         rotations[splat_ix] = v_rotation;
         shapes[splat_ix] = vec4f(v_log_scale, v_opacity_logit);
         for (var channel = 0u; channel < 3u; channel++) { sh_dc[channel * capacity + splat_ix] = SH_0 * v_color[channel]; }
-        for (var plane = 0u; plane < model.n_sh_rest; plane++) { sh_rest[plane * capacity + splat_ix] = basis[plane / 3u] * v_color[plane % 3u]; }
         error_sums[splat_ix] = sum.conic.w;
         return;
     }
-    if !finite(vec4f(v_mean, v_opacity_logit)) || !finite(v_rotation) || !finite(vec4f(v_log_scale, sum.conic.w)) || !finite(vec4f(v_color, 0.0)) {
-        atomicAdd(&status[N_POISONED], 1u);
-        return;
-    }
-
-    let step = f32(atomicLoad(&status[STEP]));
-    correction = 1.0 / (1.0 - pow(rule.betas, vec2f(step + 1.0)));
+    sh_rest_moments[splat_ix] = mean_square;
     let done = clamp((step - rule.schedule_start) / max(rule.n_planned_steps, 1.0), 0.0, 1.0);
     let mean_rate = rule.mean_rate_m * pow(rule.final_mean_rate_frac, done);
     // The costs double as the model gets able to fit what a single image shows.
@@ -209,12 +225,6 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         var moment = sh_dc_moments[at];
         sh_dc[at] -= rule.sh_dc_rate * adam1(&moment, SH_0 * v_color[channel]);
         sh_dc_moments[at] = moment;
-    }
-    for (var plane = 0u; plane < model.n_sh_rest; plane++) {
-        let at = plane * capacity + splat_ix;
-        var moment = sh_rest_moments[at];
-        sh_rest[at] -= rule.sh_rest_rate * adam1(&moment, basis[plane / 3u] * v_color[plane % 3u]);
-        sh_rest_moments[at] = moment;
     }
     error_sums[splat_ix] += sum.conic.w;
 }

@@ -9,7 +9,7 @@ use crate::optim::reference::{Adam, Moments};
 use crate::splat::params::{Growth, Rule};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
-/// Running means of every value of one splat, in the order of [`values`].
+/// Running means of every value of one splat, in the order of [`values`]; colors past the constant share the first one's.
 pub(crate) type SplatMoments = Vec<Moments>;
 
 /// Mean, log scale, rotation, opacity logit, then the coefficients of color.
@@ -58,11 +58,13 @@ pub(crate) fn update(
         .chain([of_rotation; 4])
         .chain([of_opacity])
         .chain([of_dc; 3])
-        .chain(std::iter::repeat_n(of_rest, 3 * (splat.sh.len() - 1)))
         .collect();
     let mut moved = values(splat);
+    let gradients = values(&gradient);
     let adam = Adam { beta1: rule.betas[0].into(), beta2: rule.betas[1].into(), epsilon: rule.epsilon.into() };
-    adam.update_all(step + 1, &rates, &mut moved, &values(&gradient), moments);
+    let n_own = rates.len();
+    adam.update_all(step + 1, &rates, &mut moved[..n_own], &gradients[..n_own], &mut moments[..n_own]);
+    adam.update_alike(step + 1, of_rest, &mut moved[n_own..], &gradients[n_own..], &mut moments[n_own].second);
 
     let [w, x, y, z] = splat.rotation_wxyz;
     let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
