@@ -17,7 +17,8 @@
 @group(0) @binding(7) var<storage, read> upstream: array<vec4f>;
 @group(0) @binding(8) var<storage, read> rest: array<vec2f>;
 @group(0) @binding(9) var<storage, read> last: array<u32>;
-@group(0) @binding(10) var<storage, read_write> gradients: array<f32>; // 12 a slot, see `Gradient`
+@group(0) @binding(10) var<storage, read> tile_bits: array<u32>;
+@group(0) @binding(11) var<storage, read_write> gradients: array<f32>; // 12 a slot, see `Gradient`
 
 const N_PARTS_OF_GRADIENT = 12u;
 
@@ -89,6 +90,6 @@ fn finished(sum: Gradient, conic: vec4f) -> Gradient {
 }
 
 // Where the gradients of a tile's entry go.
-fn slot_of(entry: u32, tile_bit: u32) -> u32 {
-    return entry_slots[entry] + countOneBits(entry_tiles[entry] & (tile_bit - 1u));
+fn slot_of(entry: u32, tile: Tile) -> u32 {
+    return entry_slots[entry] + countOneBits(entry_tiles[entry] & ((1u << tile.in_bin) - 1u));
 }

@@ -1,52 +1,59 @@
 // bins: squares of 4 x 4 tiles. A splat is listed once a bin, with a mask of the tiles it touches there.
 //
 // Few lists of many entries: sorting splats into them costs a fraction of sorting them into tiles, and a tile finds its
-// own in its bin's list by one bit each.
-
-#import tiles
+// own in its bin's list by one bit each. What a splat touches is decided once, by `count_bins`, and kept as integers.
 
 const BIN_TILES = 4u;
 const BLOCK = 256u;        // splats of a workgroup, neighbours in depth
 const WINDOW_BINS = 256u;  // bins a workgroup looks at
-const GROUP = 32u;         // blocks whose counts are summed by one workgroup
+const GROUP = 16u;         // blocks whose counts are summed by one workgroup
+
+// The tiles that a splat touches.
+struct Touched {
+    bin: u32,              // column and row (high 16 bits) of its first bin
+    first: u32,            // bit 4 row + column of the tiles in that bin; high 16 bits: in the bin to the right
+    second: u32,           // the same one row of bins below
+}
+
+// Larger splats touch all tiles of a rectangle: `first` and `second` are the first and past-the-last columns and rows.
+const LARGE = 0xffffffffu; // as `bin`
 
 fn n_bins(n_tiles: vec2u) -> vec2u {
     return (n_tiles + vec2u(BIN_TILES - 1u)) / BIN_TILES;
 }
 
-// The columns of tiles that an ellipse touches in the four rows of tiles of a row of bins.
-struct BinRow {
-    begin: vec4i,
-    end: vec4i,
+// First and past-the-last column (x, y) and row (z, w) of the bins.
+fn bins_of(touched: Touched) -> vec4u {
+    if touched.bin == LARGE {
+        let columns = vec2u(touched.first & 0xffffu, touched.first >> 16u);
+        let rows = vec2u(touched.second & 0xffffu, touched.second >> 16u);
+        return vec4u(columns.x / BIN_TILES, (columns.y + 3u) / BIN_TILES, rows.x / BIN_TILES, (rows.y + 3u) / BIN_TILES);
+    }
+    if (touched.first | touched.second) == 0u { return vec4u(0u); }
+    let bin = vec2u(touched.bin & 0xffffu, touched.bin >> 16u);
+    let n_columns = select(1u, 2u, ((touched.first | touched.second) >> 16u) != 0u);
+    return vec4u(bin.x, bin.x + n_columns, bin.y, bin.y + select(1u, 2u, touched.second != 0u));
 }
 
-fn bin_row(ellipse: Ellipse, row: i32, tile_rows: vec2i, n_tiles: vec2u) -> BinRow {
-    // Four by name: indexing by a variable would put them into memory.
-    let a = columns_of_row(ellipse, row * 4, tile_rows, n_tiles);
-    let b = columns_of_row(ellipse, row * 4 + 1, tile_rows, n_tiles);
-    let c = columns_of_row(ellipse, row * 4 + 2, tile_rows, n_tiles);
-    let d = columns_of_row(ellipse, row * 4 + 3, tile_rows, n_tiles);
-    return BinRow(vec4i(a.x, b.x, c.x, d.x), vec4i(a.y, b.y, c.y, d.y));
+fn bits_between(begin: u32, end: u32) -> u32 {
+    return (1u << end) - (1u << min(begin, end));
 }
 
-fn columns_of_row(ellipse: Ellipse, row: i32, tile_rows: vec2i, n_tiles: vec2u) -> vec2i {
-    if row < tile_rows.x || row >= tile_rows.y { return vec2i(0); }
-    return tile_columns(ellipse, row, n_tiles);
+// The mask of the tiles it touches in one of these bins.
+fn tiles_in_bin(touched: Touched, column: u32, row: u32) -> u32 {
+    if touched.bin == LARGE {
+        let corner = vec2u(column, row) * BIN_TILES;
+        let from_ = max(vec2u(touched.first & 0xffffu, touched.second & 0xffffu), corner) - corner;
+        let to = min(max(vec2u(touched.first >> 16u, touched.second >> 16u), corner) - corner, vec2u(BIN_TILES));
+        let columns = bits_between(from_.x, to.x);
+        let rows = bits_between(from_.y, to.y);
+        return columns * ((rows & 1u) | (rows & 2u) << 3u | (rows & 4u) << 6u | (rows & 8u) << 9u);
+    }
+    let pair = select(touched.second, touched.first, row == touched.bin >> 16u);
+    return select(pair >> 16u, pair & 0xffffu, column == (touched.bin & 0xffffu));
 }
 
-// First and past-the-last column of bins.
-fn bin_columns(row: BinRow) -> vec2i {
-    let some = row.end > row.begin;
-    let begin = select(vec4i(0x7fffffff), row.begin, some);
-    let end = select(vec4i(0), row.end, some);
-    let first = min(min(begin.x, begin.y), min(begin.z, begin.w)) / 4;
-    return vec2i(first, max(first, (max(max(end.x, end.y), max(end.z, end.w)) + 3) / 4));
-}
-
-// Bit 4 row + column for each tile of the bin that is touched.
-fn tiles_in_bin(row: BinRow, column: i32) -> u32 {
-    let begin = vec4u(clamp(row.begin - column * 4, vec4i(0), vec4i(4)));
-    let end = max(vec4u(clamp(row.end - column * 4, vec4i(0), vec4i(4))), begin);
-    let bits = ((vec4u(1u) << end) - (vec4u(1u) << begin)) << vec4u(0u, 4u, 8u, 12u);
-    return bits.x | bits.y | bits.z | bits.w;
+fn n_tiles_of(touched: Touched) -> u32 {
+    if touched.bin != LARGE { return countOneBits(touched.first) + countOneBits(touched.second); }
+    return ((touched.first >> 16u) - (touched.first & 0xffffu)) * ((touched.second >> 16u) - (touched.second & 0xffffu));
 }

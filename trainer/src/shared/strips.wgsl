@@ -9,7 +9,7 @@ const N_STRIPS = 8u;
 
 #import pixels
 
-const QUEUE = 256u;
+const QUEUE = 512u;
 var<workgroup> wg_queue: array<u32, QUEUE>;
 
 // Where in its tile the lane's first pixel of a strip lies.
@@ -43,19 +43,30 @@ fn sum_of_lanes(mine: vec4f) -> vec4f {
     return all + subgroupShuffleXor(all, 4u);
 }
 
-// Queues the tile's entries from `next` on, in order, until the queue is full or the list ends: x how many, y the next.
-fn queue_entries(lane: u32, next: u32, end: u32, tile_bit: u32) -> vec2u {
+// Queues the tile's entries from word `next` on, in order, until the queue might overflow or the list ends: x how many,
+// y the next word.
+fn queue_entries(lane: u32, next: u32, tile: Tile) -> vec2u {
     workgroupBarrier(); // Nobody reads the queue any more.
     var n = 0u;
-    var first = next;
-    while first < end && n + LANES <= QUEUE {
-        let entry = first + lane;
-        let mine = select(0u, 1u << lane, entry < end && (entry_tiles[min(entry, end - 1u)] & tile_bit) != 0u);
-        let kept = or_of_lanes(mine);
-        if mine != 0u { wg_queue[n + countOneBits(kept & (mine - 1u))] = entry; }
-        n += countOneBits(kept);
-        first += LANES;
+    var word = next;
+    while word * 32u < tile.end && n + LANES * 32u <= QUEUE {
+        var bits = entries_of(tile, word + lane);
+        let n_mine = countOneBits(bits);
+        // The sum over the lanes below, by doubling.
+        var upto = n_mine;
+        for (var stride = 1u; stride < LANES; stride *= 2u) {
+            let below = subgroupShuffle(upto, max(lane, stride) - stride);
+            upto += select(0u, below, lane >= stride);
+        }
+        var at = n + upto - n_mine;
+        while bits != 0u {
+            wg_queue[at] = (word + lane) * 32u + firstTrailingBit(bits);
+            bits &= bits - 1u;
+            at++;
+        }
+        n += subgroupShuffle(upto, LANES - 1u);
+        word += LANES;
     }
     workgroupBarrier(); // The queue is there.
-    return vec2u(n, first);
+    return vec2u(n, word);
 }

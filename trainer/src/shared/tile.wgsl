@@ -1,9 +1,9 @@
-// tile: where a tile lies, and the list of its bin. For kernels that bind view, status and bin_starts.
+// tile: where a tile lies, and the list of its bin. For kernels that bind view, status, bin_starts and tile_bits.
 
 struct Tile {
     in_grid: bool,
     corner: vec2u,     // pixels
-    bit: u32,          // its own in entry_tiles
+    in_bin: u32,       // its own bit in entry_tiles, its plane of tile_bits
     begin: u32,        // of the bin's list
     end: u32,
 }
@@ -13,11 +13,20 @@ fn tile_at(tile: u32) -> Tile {
     out.in_grid = tile < view.n_tiles.x * view.n_tiles.y;
     let place = vec2u(tile % view.n_tiles.x, tile / view.n_tiles.x);
     out.corner = place * TILE_PX;
-    out.bit = 1u << (place.y % BIN_TILES * BIN_TILES + place.x % BIN_TILES);
+    out.in_bin = place.y % BIN_TILES * BIN_TILES + place.x % BIN_TILES;
     if out.in_grid && status[FAILED] == 0u {
         let bin = place.y / BIN_TILES * n_bins(view.n_tiles).x + place.x / BIN_TILES;
         out.begin = bin_starts[bin];
         out.end = bin_starts[bin + 1u];
     }
     return out;
+}
+
+// Which of the entries 32 word to 32 word + 31 the tile must look at.
+fn entries_of(tile: Tile, word: u32) -> u32 {
+    if word * 32u >= tile.end { return 0u; }
+    var bits = tile_bits[arrayLength(&tile_bits) / 16u * tile.in_bin + word];
+    if word * 32u < tile.begin { bits &= 0xffffffffu << (tile.begin - word * 32u); }
+    if tile.end - word * 32u < 32u { bits &= (1u << (tile.end - word * 32u)) - 1u; }
+    return bits;
 }

@@ -3,11 +3,13 @@
 // A lane has two neighbouring pixels in each quarter of 8 x 8 of the tile, so that a splat is looked at only in the
 // quarters it touches. Small workgroups with little memory: more of them hide each other's waiting.
 
+#import tiles
+
 const LANES = 32u;
 const BATCH = LANES;
-const CHUNK = 256u;        // entries looked through at once
-var<workgroup> wg_keep: array<atomic<u32>, 8>; // [CHUNK / 32]
-var<workgroup> wg_queue: array<u32, CHUNK>;
+const WORDS = 16u;         // of 32 entries, looked through at once
+var<workgroup> wg_words: array<u32, WORDS>;
+var<workgroup> wg_queue: array<u32, 512>;
 var<workgroup> wg_drawn: array<Drawn, BATCH>;  // color.w: bits of the rank in the bin's list
 var<workgroup> wg_quarters: array<u32, BATCH>; // that the splat may touch, see `quarters_touched`
 
@@ -16,21 +18,27 @@ fn lane_px(lane: u32) -> vec2u {
     return vec2u(lane % 4u * 2u, lane / 4u);
 }
 
-// Queues the tile's entries out of the next `CHUNK`, in order; returns how many. Every lane must call it.
-fn queue_chunk(lane: u32, first: u32, tile: Tile) -> u32 {
-    if lane < CHUNK / 32u { atomicStore(&wg_keep[lane], 0u); }
-    workgroupBarrier(); // All bits are zero, and nobody reads the queue any more.
-    for (var word = 0u; word < CHUNK / 32u; word++) {
-        let entry = first + word * 32u + lane;
-        if entry < tile.end && (entry_tiles[entry] & tile.bit) != 0u { atomicOr(&wg_keep[word], 1u << lane); }
-    }
-    workgroupBarrier(); // All bits are set.
+// Queues the tile's entries out of the next `WORDS` words, in order; returns how many. Every lane must call it.
+fn queue_words(lane: u32, first: u32, tile: Tile) -> u32 {
+    if lane < WORDS { wg_words[lane] = entries_of(tile, first + lane); }
+    workgroupBarrier(); // The words are there, and nobody reads the queue any more.
+    // Two lanes a word.
+    let mine = lane / 2u;
     var n = 0u;
-    for (var word = 0u; word < CHUNK / 32u; word++) {
-        let bits = atomicLoad(&wg_keep[word]);
-        let mine = 1u << lane;
-        if (bits & mine) != 0u { wg_queue[n + countOneBits(bits & (mine - 1u))] = first + word * 32u + lane; }
-        n += countOneBits(bits);
+    var at = 0u;
+    for (var word = 0u; word < WORDS; word++) {
+        if word == mine { at = n; }
+        n += countOneBits(wg_words[word]);
+    }
+    var bits = wg_words[mine] & 0xffffu;
+    if lane % 2u == 1u {
+        at += countOneBits(bits);
+        bits = wg_words[mine] & 0xffff0000u;
+    }
+    while bits != 0u {
+        wg_queue[at] = (first + mine) * 32u + firstTrailingBit(bits);
+        bits &= bits - 1u;
+        at++;
     }
     workgroupBarrier(); // The queue is there.
     return n;

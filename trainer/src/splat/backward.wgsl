@@ -1,7 +1,7 @@
 // backward: the gradient of every intersection of splat and tile.
 //
 // threads   32 per tile, two pixels in each of its quarters a lane
-// reads     view, status, bin_starts, entry_tiles, entry_splats, entry_slots, drawn, upstream [n_pixels] (slope towards rgb
+// reads     view, status, bin_starts, tile_bits, entry_tiles, entry_splats, entry_slots, drawn, upstream [n_pixels] (slope towards rgb
 //           and depth), rest [n_pixels] (color . v_color + depth v_depth + transmittance v_transmittance of the finished
 //           pixel; y: absolute error), last
 // writes    gradients [n_slots]: every slot by its only owner
@@ -56,11 +56,11 @@ fn backward(tile_ix: u32, lane: u32) {
     workgroupBarrier(); // All have told their last.
     if lane == 0u { wg_past = atomicLoad(&wg_past_last); }
     let past_last = workgroupUniformLoad(&wg_past);
-    for (var chunk = tile.begin; chunk < tile.end; chunk += CHUNK) {
-        let n_queued = queue_chunk(lane, chunk, tile);
+    for (var word = tile.begin / 32u; word * 32u < tile.end; word += WORDS) {
+        let n_queued = queue_words(lane, word, tile);
         for (var batch = 0u; batch < n_queued; batch += BATCH) {
             workgroupBarrier(); // Nobody reads the last batch's slots any more.
-            if batch + lane < n_queued { wg_slots[lane] = slot_of(wg_queue[batch + lane], tile.bit); }
+            if batch + lane < n_queued { wg_slots[lane] = slot_of(wg_queue[batch + lane], tile); }
             take_batch(lane, batch, n_queued, tile);
             let n = min(n_queued - batch, BATCH);
             if bitcast<u32>(wg_drawn[0].color.w) >= past_last {

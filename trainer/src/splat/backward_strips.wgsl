@@ -75,10 +75,10 @@ fn pass_strip(lane: u32, own: ptr<function, Owned>, strip: Strip, pixels: ptr<fu
     }
 }
 
-fn hand_in(own: Owned, tile_bit: u32) {
+fn hand_in(own: Owned, tile: Tile) {
     if own.entry == 0xffffffffu { return; }
     let sum = finished(own.sum, own.splat.conic);
-    let at = slot_of(own.entry, tile_bit) * N_PARTS_OF_GRADIENT;
+    let at = slot_of(own.entry, tile) * N_PARTS_OF_GRADIENT;
     for (var k = 0u; k < 4u; k++) {
         gradients[at + k] = sum.place[k];
         gradients[at + 4u + k] = sum.conic[k];
@@ -96,9 +96,9 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         wg_between[strip * LANES + lane] = Between(pixels.transmittance, pixels.behind);
     }
     let past_last = max_of_lanes(most_of_tile);
-    var next = tile.begin;
-    while next < tile.end {
-        let queued = queue_entries(lane, next, tile.end, tile.bit);
+    var next = tile.begin / 32u;
+    while next * 32u < tile.end {
+        let queued = queue_entries(lane, next, tile);
         next = queued.y;
         for (var batch = 0u; batch < queued.x; batch += BATCH) {
             // Four by name and not an array: the compiler then keeps them out of memory that is read lane after lane.
@@ -122,10 +122,10 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
                 pass_strip(lane, &d, strip, &pixels);
                 wg_between[strip_ix * LANES + lane] = Between(pixels.transmittance, pixels.behind);
             }
-            hand_in(a, tile.bit);
-            hand_in(b, tile.bit);
-            hand_in(c, tile.bit);
-            hand_in(d, tile.bit);
+            hand_in(a, tile);
+            hand_in(b, tile);
+            hand_in(c, tile);
+            hand_in(d, tile);
         }
     }
 }

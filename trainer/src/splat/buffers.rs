@@ -13,7 +13,7 @@ pub(crate) const DEPTH_BITS: u32 = 24;
 /// Splats of a block, neighbours in depth; bins a workgroup looks at; blocks of a group: as in shared/bins.wgsl.
 pub(crate) const BLOCK: u32 = 256;
 pub(crate) const WINDOW_BINS: u32 = 256;
-pub(crate) const GROUP: u32 = 32;
+pub(crate) const GROUP: u32 = 16;
 
 /// Floats of the spherical harmonics past the constant one.
 pub(crate) fn n_sh_rest(sh_degree: u32) -> u32 {
@@ -194,10 +194,13 @@ impl SplatBuffers {
 /// What one view of the model needs while it is drawn, and learned from.
 #[derive(Debug)]
 pub(crate) struct Scratch {
+    pub(crate) n_entries: u32,
     pub(crate) capacity: Buffer,
     pub(crate) drawn: Buffer,
     pub(crate) tile_counts: Buffer,
+    pub(crate) touched: Buffer,
     pub(crate) slot_offsets: Buffer,
+    pub(crate) slot_begins: Buffer,
     pub(crate) block_slots: Buffer,
     pub(crate) by_depth: SortBuffers,
     pub(crate) bin_counts: Buffer,
@@ -207,6 +210,7 @@ pub(crate) struct Scratch {
     pub(crate) entry_tiles: Buffer,
     pub(crate) entry_splats: Buffer,
     pub(crate) entry_slots: Buffer,
+    pub(crate) tile_bits: Buffer,
     pub(crate) gradients: Buffer,
 }
 
@@ -228,10 +232,13 @@ impl Scratch {
         let n_blocks = n_splats.div_ceil(BLOCK);
         let per_bin = |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n_bins) * u64::from(n.max(1)));
         Ok(Self {
+            n_entries,
             capacity: gpu.uniform_with("splat.capacity", &Capacity { n_entries, n_slots, unused: [0; 2] }),
             drawn: gpu.storage("splat.drawn", 48 * u64::from(n_splats))?,
             tile_counts: words("splat.tile_counts", n_splats)?,
+            touched: gpu.storage("splat.touched", 12 * u64::from(n_splats))?,
             slot_offsets: words("splat.slot_offsets", n_splats)?,
+            slot_begins: words("splat.slot_begins", n_splats)?,
             block_slots: words("splat.block_slots", n_blocks)?,
             by_depth: pipelines.sort.buffers(gpu, "splat.by_depth", n_splats, DEPTH_BITS, status::N_SPLATS)?,
             bin_counts: per_bin("splat.bin_counts", n_blocks)?,
@@ -241,6 +248,7 @@ impl Scratch {
             entry_tiles: words("splat.entry_tiles", n_entries)?,
             entry_splats: words("splat.entry_splats", n_entries)?,
             entry_slots: words("splat.entry_slots", n_entries)?,
+            tile_bits: gpu.storage("splat.tile_bits", 64 * u64::from(n_entries.div_ceil(32).max(1)))?,
             gradients: gpu.storage("splat.gradients", 48 * u64::from(n_slots))?,
         })
     }

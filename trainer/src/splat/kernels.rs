@@ -108,6 +108,7 @@ pub const KERNELS: &[Kernel] = &[
     kernel!("scan_bins"),
     kernel!("allocate"),
     kernel!("emit"),
+    kernel!("tile_bits"),
     kernel!("rasterize", BLEND),
     kernel!("rasterize_strips", BLEND_STRIPS),
     kernel!("finish"),
@@ -134,6 +135,7 @@ pub(crate) struct DrawPipelines {
     pub(crate) scan_bins: Pipeline,
     pub(crate) allocate: Pipeline,
     pub(crate) emit: Pipeline,
+    pub(crate) tile_bits: Pipeline,
     pub(crate) rasterize: Pipeline,
     pub(crate) finish: Pipeline,
 }
@@ -148,6 +150,7 @@ impl DrawPipelines {
             scan_bins: Pipeline::new(gpu, kernel!("scan_bins"), &[])?,
             allocate: Pipeline::new(gpu, kernel!("allocate"), &[])?,
             emit: Pipeline::new(gpu, kernel!("emit"), &[])?,
+            tile_bits: Pipeline::new(gpu, kernel!("tile_bits"), &[])?,
             rasterize: Pipeline::new(gpu, blend(gpu).rasterize, &[])?,
             finish: Pipeline::new(gpu, kernel!("finish"), &[])?,
         })

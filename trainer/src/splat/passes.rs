@@ -119,9 +119,6 @@ impl ViewPasses<'_> {
                 ("sh_rest", &splats.sh_rest),
                 ("drawn", &scratch.drawn),
                 ("depth_keys", &scratch.by_depth.keys[0]),
-                ("tile_counts", &scratch.tile_counts),
-                ("slot_offsets", &scratch.slot_offsets),
-                ("block_slots", &scratch.block_slots),
             ],
         );
         let half = pipelines.sort.sort(gpu, passes, &scratch.by_depth, status, DEPTH_BITS);
@@ -131,7 +128,10 @@ impl ViewPasses<'_> {
         let [bin_counts, group_counts] = [("bin_counts", &scratch.bin_counts), ("group_counts", &scratch.group_counts)];
         let [bin_totals, bin_starts] = [("bin_totals", &scratch.bin_totals), ("bin_starts", &scratch.bin_starts)];
         let [block_slots, status] = [("block_slots", &scratch.block_slots), ("status", status)];
-        let counted = [view, model, by_depth, tile_counts, drawn, bin_counts];
+        let [touched, slot_offsets] = [("touched", &scratch.touched), ("slot_offsets", &scratch.slot_offsets)];
+        let keys = ("depth_keys", &scratch.by_depth.keys[half]);
+        let counted =
+            [view, model, keys, by_depth, drawn, touched, tile_counts, slot_offsets, block_slots, bin_counts];
         passes.dispatch(gpu, &pipelines.count_bins, n_blocks * n_windows, &counted);
         let n_groups = n_blocks.div_ceil(u64::from(GROUP));
         passes.dispatch(gpu, &pipelines.sum_bins, n_groups * n_windows, &[view, model, bin_counts, group_counts]);
@@ -139,23 +139,28 @@ impl ViewPasses<'_> {
         passes.dispatch(gpu, &pipelines.scan_bins, u64::from(n_bins(size_px)), &scanned);
         let allocated = [view, model, ("capacity", &scratch.capacity), bin_totals, bin_starts, block_slots, status];
         passes.dispatch(gpu, &pipelines.allocate, 1, &allocated);
+        let [entry_tiles, entry_splats] =
+            [("entry_tiles", &scratch.entry_tiles), ("entry_splats", &scratch.entry_splats)];
         let emitted = [
             view,
             model,
-            group_counts,
             by_depth,
-            drawn,
+            touched,
             bin_counts,
+            group_counts,
             bin_starts,
-            ("slot_offsets", &scratch.slot_offsets),
+            slot_offsets,
             block_slots,
             status,
-            tile_counts,
-            ("entry_tiles", &scratch.entry_tiles),
-            ("entry_splats", &scratch.entry_splats),
+            entry_tiles,
+            entry_splats,
             ("entry_slots", &scratch.entry_slots),
+            ("slot_begins", &scratch.slot_begins),
         ];
         passes.dispatch(gpu, &pipelines.emit, n_blocks * n_windows, &emitted);
+        let tile_bits = ("tile_bits", &scratch.tile_bits);
+        let n_groups = u64::from(scratch.n_entries.div_ceil(512));
+        passes.dispatch(gpu, &pipelines.tile_bits, n_groups, &[status, entry_tiles, tile_bits]);
         passes.dispatch(
             gpu,
             &pipelines.rasterize,
@@ -164,8 +169,8 @@ impl ViewPasses<'_> {
                 view,
                 status,
                 bin_starts,
-                ("entry_tiles", &scratch.entry_tiles),
-                ("entry_splats", &scratch.entry_splats),
+                tile_bits,
+                entry_splats,
                 drawn,
                 ("image", &frame.image),
                 ("depth", &frame.depth),
@@ -236,6 +241,7 @@ impl ViewPasses<'_> {
                 ("view", view),
                 ("status", status),
                 ("bin_starts", &scratch.bin_starts),
+                ("tile_bits", &scratch.tile_bits),
                 ("entry_tiles", &scratch.entry_tiles),
                 ("entry_splats", &scratch.entry_splats),
                 ("entry_slots", &scratch.entry_slots),
@@ -260,8 +266,7 @@ impl ViewPasses<'_> {
                 ("model", &splats.model),
                 ("rule", rule),
                 ("tile_counts", &scratch.tile_counts),
-                ("slot_offsets", &scratch.slot_offsets),
-                ("block_slots", &scratch.block_slots),
+                ("slot_begins", &scratch.slot_begins),
                 ("gradients", &scratch.gradients),
                 ("means", &splats.means),
                 ("rotations", &splats.rotations),

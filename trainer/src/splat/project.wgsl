@@ -1,18 +1,15 @@
-// project: place every splat on the image plane, color it, and count the tiles it touches.
+// project: place every splat on the image plane and color it.
 //
-// threads   256 per block of 256 splats
+// threads   one per splat
 // reads     view, model, means, rotations, shapes, sh_dc, sh_rest
-// writes    drawn [n_splats], depth_keys [n_splats] (24 bits; all ones where unseen), tile_counts [n_splats],
-//           slot_offsets [n_splats] (within the block), block_slots [n_blocks] (intersections of the block)
+// writes    drawn [n_splats], depth_keys [n_splats] (24 bits; all ones where unseen)
 // twin      splat/reference/project.rs
 // source    Zwicker et al. 2001 (EWA volume splatting); Kerbl et al. 2023, section 4
 
 #import view
 #import model
 #import projection
-#import tiles
 #import sh
-#import scan
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> model: Model;
@@ -23,9 +20,6 @@
 @group(0) @binding(6) var<storage, read> sh_rest: array<f32>;       // 3 planes a basis function
 @group(0) @binding(7) var<storage, read_write> drawn: array<Drawn>;
 @group(0) @binding(8) var<storage, read_write> depth_keys: array<u32>;
-@group(0) @binding(9) var<storage, read_write> tile_counts: array<u32>;
-@group(0) @binding(10) var<storage, read_write> slot_offsets: array<u32>;
-@group(0) @binding(11) var<storage, read_write> block_slots: array<u32>;
 
 const UNSEEN = 0xffffffu;
 
@@ -39,8 +33,11 @@ fn sh_term(sums: ptr<function, ShSums>, k: u32, basis: f32, slope: vec3f) {
     (*sums).color += basis * vec3f(sh_rest[at], sh_rest[at + model.capacity], sh_rest[at + 2u * model.capacity]);
 }
 
-// Places and colors a splat; says how many tiles it touches.
-fn draw(splat_ix: u32) -> u32 {
+override WG_SIZE = 256u;
+@compute @workgroup_size(WG_SIZE)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let splat_ix = folded(wg, n_wgs) * WG_SIZE + lane;
+    if splat_ix >= model.n_splats { return; } // Allowed here: no barrier, no subgroup operation below.
     let mean = means[splat_ix].xyz;
     let shape = shapes[splat_ix];
     let projection = project_splat(view, mean, rotations[splat_ix], shape.xyz);
@@ -49,12 +46,15 @@ fn draw(splat_ix: u32) -> u32 {
     // Written so that a NaN anywhere is not seen.
     let seen = projection.seen && opacity > MIN_ALPHA && projection.determinant > 0.0 && inside_crop(view, mean)
         && abs(projection.mean_px.x) < 1e6 && abs(projection.mean_px.y) < 1e6 && projection.covariance.x + projection.covariance.z < 1e12;
-    if !seen { return 0u; }
+    if !seen { return; }
 
     let conic = vec3f(projection.covariance.z, -projection.covariance.y, projection.covariance.x) / projection.determinant;
     let reach = 2.0 * log(255.0 * opacity);
-    let n_touched = n_tiles_touched(Ellipse(projection.mean_px, conic, reach), view.n_tiles);
-    if n_touched == 0u { return 0u; }
+    // The box around the ellipse where anything is drawn, and half a pixel more.
+    let half_px = sqrt(max(vec2f(reach) * projection.covariance.xz, vec2f(0.0))) + 0.5;
+    let last = projection.mean_px + half_px;
+    let first = projection.mean_px - half_px;
+    if any(last < vec2f(0.0)) || any(first > vec2f(view.size_px)) { return; }
 
     let constant = vec3f(sh_dc[splat_ix], sh_dc[model.capacity + splat_ix], sh_dc[2u * model.capacity + splat_ix]);
     var sums = ShSums(splat_ix, vec3f(0.5) + SH_0 * constant);
@@ -65,20 +65,4 @@ fn draw(splat_ix: u32) -> u32 {
     // and sixteen octaves fit; what is further comes last, in the order of the splats.
     let beyond_near = bitcast<u32>(projection.point.z) - bitcast<u32>(view.shutter_linear.w);
     depth_keys[splat_ix] = min(beyond_near >> 3u, UNSEEN - 1u);
-    return n_touched;
-}
-
-@compute @workgroup_size(256)
-fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
-    let block = folded(wg, n_wgs);
-    let splat_ix = block * 256u + lane;
-    var n_touched = 0u;
-    if splat_ix < model.n_splats { n_touched = draw(splat_ix); }
-    var total = 0u;
-    let offset = exclusive_scan(lane, n_touched, &total);
-    if splat_ix < model.n_splats {
-        tile_counts[splat_ix] = n_touched;
-        slot_offsets[splat_ix] = offset;
-        if lane == 0u { block_slots[block] = total; }
-    }
 }

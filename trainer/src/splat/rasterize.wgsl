@@ -1,7 +1,7 @@
 // rasterize: blend each tile's splats front to back.
 //
 // threads   32 per tile, two pixels in each of its quarters a lane
-// reads     view, status, bin_starts, entry_tiles, entry_splats, drawn
+// reads     view, status, bin_starts, tile_bits, entry_splats, drawn
 // writes    image [n_pixels] (premultiplied rgb, transmittance), depth [n_pixels] (premultiplied), last [n_pixels]
 //           (past the last contributor, counted from the first of the bin's list)
 // twin      splat/reference/rasterize.rs
@@ -44,8 +44,8 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     var d = unblended(on_image(tile, first + vec2u(8u, 8u)));
     var counted = false;
     var all_done = false;
-    for (var chunk = tile.begin; chunk < tile.end && !all_done; chunk += CHUNK) {
-        let n_queued = queue_chunk(lane, chunk, tile);
+    for (var word = tile.begin / 32u; word * 32u < tile.end && !all_done; word += WORDS) {
+        let n_queued = queue_words(lane, word, tile);
         for (var batch = 0u; batch < n_queued && !all_done; batch += BATCH) {
             take_batch(lane, batch, n_queued, tile);
             let n = min(n_queued - batch, BATCH);

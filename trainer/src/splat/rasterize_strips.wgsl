@@ -16,10 +16,10 @@ var<workgroup> wg_blends: array<Blend, 64>; // [N_STRIPS, LANES], between two qu
 @compute @workgroup_size(LANES)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(subgroup_invocation_id) lane: u32) {
     let tile = tile_at(folded(wg, n_wgs));
-    var next = tile.begin;
+    var next = tile.begin / 32u;
     var unfinished = true;
     for (var turn = 0u; unfinished; turn++) {
-        let queued = queue_entries(lane, next, tile.end, tile.bit);
+        let queued = queue_entries(lane, next, tile);
         next = queued.y;
         var live_strips = 0u;
         for (var strip = 0u; strip < N_STRIPS; strip++) {
@@ -55,8 +55,8 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
                 any_live = or_of_lanes(select(0u, 1u, any(blend.live))) != 0u;
             }
             live_strips |= select(0u, 1u, any_live);
-            unfinished = next < tile.end && live_strips != 0u;
-            if next < tile.end { wg_blends[strip * LANES + lane] = blend; }
+            unfinished = next * 32u < tile.end && live_strips != 0u;
+            if next * 32u < tile.end { wg_blends[strip * LANES + lane] = blend; }
             write_pixels(first, on_image, blend);
         }
     }

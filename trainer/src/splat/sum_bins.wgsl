@@ -1,8 +1,8 @@
-// sum_bins: per bin and group of 32 blocks, how many entries come from earlier blocks of the group; and how many it has.
+// sum_bins: how many entries each group of 16 blocks has in each bin.
 //
 // threads   256 per group and window of 256 bins, a lane a bin
-// reads     view, model
-// writes    bin_counts [n_blocks, n_bins] (in place), group_counts [n_groups, n_bins]
+// reads     view, model, bin_counts [n_blocks, n_bins]
+// writes    group_counts [n_groups, n_bins]
 
 #import view
 #import model
@@ -10,7 +10,7 @@
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> model: Model;
-@group(0) @binding(2) var<storage, read_write> bin_counts: array<u32>;
+@group(0) @binding(2) var<storage, read> bin_counts: array<u32>;
 @group(0) @binding(3) var<storage, read_write> group_counts: array<u32>;
 
 @compute @workgroup_size(256)
@@ -22,11 +22,8 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let n_blocks = (model.n_splats + BLOCK - 1u) / BLOCK;
     if bin >= bins.x * bins.y || group * GROUP >= n_blocks { return; } // Allowed here: no barrier below.
     var sum = 0u;
-    for (var block = group * GROUP; block < min(group * GROUP + GROUP, n_blocks); block++) {
-        let at = block * bins.x * bins.y + bin;
-        let n = bin_counts[at];
-        bin_counts[at] = sum;
-        sum += n;
+    for (var i = 0u; i < GROUP; i++) {
+        if group * GROUP + i < n_blocks { sum += bin_counts[(group * GROUP + i) * bins.x * bins.y + bin]; }
     }
     group_counts[group * bins.x * bins.y + bin] = sum;
 }

@@ -1,7 +1,7 @@
 // update: sum each splat's gradients over its intersections, carry them to its parameters, and take one Adam step.
 //
 // threads   one per splat
-// reads     view, model, rule, drawn, tile_counts, slot_offsets, block_slots, gradients, status
+// reads     view, model, rule, drawn, tile_counts, slot_begins, gradients, status
 // writes    means, rotations, shapes, sh_dc, sh_rest, their moments, error_sums; or, with GRADIENTS_ONLY, the gradients
 //           themselves in place of the values, for tests
 // twin      splat/reference/project.rs, backward; optim/reference.rs
@@ -45,7 +45,7 @@ struct Rule {
 @group(0) @binding(1) var<uniform> model: Model;
 @group(0) @binding(2) var<uniform> rule: Rule;
 @group(0) @binding(3) var<storage, read> tile_counts: array<u32>;
-@group(0) @binding(4) var<storage, read> slot_offsets: array<u32>;
+@group(0) @binding(4) var<storage, read> slot_begins: array<u32>;
 @group(0) @binding(5) var<storage, read> gradients: array<Gradient>;
 @group(0) @binding(6) var<storage, read_write> means: array<vec4f>;
 @group(0) @binding(7) var<storage, read_write> rotations: array<vec4f>;
@@ -57,8 +57,7 @@ struct Rule {
 @group(0) @binding(13) var<storage, read_write> sh_rest_moments: array<f32>;     // second, shared
 @group(0) @binding(14) var<storage, read_write> status: array<atomic<u32>>;
 @group(0) @binding(15) var<storage, read_write> error_sums: array<f32>;        // since the last change of the splat count
-@group(0) @binding(16) var<storage, read> block_slots: array<u32>;
-@group(0) @binding(17) var<storage, read> drawn: array<Drawn>;
+@group(0) @binding(16) var<storage, read> drawn: array<Drawn>;
 
 override WG_SIZE = 256u;
 override GRADIENTS_ONLY: bool = false;
@@ -110,7 +109,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     if n_touched == 0u && rule.update_all == 0u && !GRADIENTS_ONLY { return; }
 
     var sum: Gradient;
-    let begin = block_slots[splat_ix / 256u] + slot_offsets[splat_ix];
+    let begin = slot_begins[splat_ix];
     for (var slot = begin; slot < begin + n_touched; slot++) {
         let part = gradients[slot];
         sum.place += part.place;
