@@ -1,19 +1,30 @@
-//! Stable radix sort of 32-bit keys with 32-bit values on the GPU, eight bits a pass.
+//! Stable radix sort of 32-bit keys on the GPU, in two passes of eight bits: the keys are cut to 16 bits between the least and
+//! the largest of them. Yields the places the keys had before.
 //!
 //! Two forms with the same result: `parallel` ranks by subgroup ballots, `sequential` gives each thread a block of its own.
 
 use crate::Error;
 use crate::gpu::{Buffer, Gpu, Kernel, Passes, Pipeline, Source};
 
-const SHARED: &[Source] = &[
-    Source { name: "view", text: include_str!("../shared/view.wgsl") },
-    Source { name: "scan", text: include_str!("../shared/scan.wgsl") },
-    Source { name: "digit", text: include_str!("digit.wgsl") },
-];
+macro_rules! sources {
+    ($($name:literal => $file:literal),*) => {
+        &[$(Source { name: $name, text: include_str!($file) }),*]
+    };
+}
+
+const SHARED: &[Source] = sources!(
+    "view" => "../shared/view.wgsl", "scan" => "../shared/scan.wgsl", "digit" => "digit.wgsl", "peers" => "peers_32.wgsl"
+);
+const SHARED_WIDE: &[Source] = sources!(
+    "view" => "../shared/view.wgsl", "scan" => "../shared/scan.wgsl", "digit" => "digit.wgsl", "peers" => "peers_128.wgsl"
+);
 
 macro_rules! kernel {
     ($name:literal) => {
-        Kernel { source: Source { name: $name, text: include_str!(concat!($name, ".wgsl")) }, shared: SHARED }
+        kernel!($name, SHARED)
+    };
+    ($name:literal, $shared:expr) => {
+        Kernel { source: Source { name: $name, text: include_str!(concat!($name, ".wgsl")) }, shared: $shared }
     };
 }
 
@@ -22,6 +33,7 @@ pub const KERNELS: &[Kernel] = &[
     kernel!("radix_count_parallel"),
     kernel!("radix_scan_parallel"),
     kernel!("radix_scatter_parallel"),
+    kernel!("radix_scatter_parallel", SHARED_WIDE),
     kernel!("radix_count_sequential"),
     kernel!("radix_scan_sequential"),
     kernel!("radix_scatter_sequential"),
@@ -33,8 +45,8 @@ pub const KERNELS: &[Kernel] = &[
 struct Digit {
     shift: u32,
     counter: u32,
+    largest: u32,
     max_blocks: u32,
-    unused: u32,
 }
 
 /// Compiled kernels of one form.
@@ -56,7 +68,7 @@ pub struct SortBuffers {
     pub values: [Buffer; 2],
     counts: Buffer,
     totals: Buffer,
-    digits: Vec<Buffer>,
+    digits: [Buffer; 2],
     max_blocks: u32,
 }
 
@@ -68,8 +80,20 @@ impl RadixSort {
     }
 
     fn of_form(gpu: &Gpu, parallel: bool) -> Result<Self, Error> {
-        let [count, scan, scatter] =
-            if parallel { [KERNELS[0], KERNELS[1], KERNELS[2]] } else { [KERNELS[3], KERNELS[4], KERNELS[5]] };
+        let wide = gpu.optional().subgroup_lanes.is_some_and(|lanes| lanes > 32);
+        let [count, scan, scatter] = if parallel {
+            [
+                kernel!("radix_count_parallel"),
+                kernel!("radix_scan_parallel"),
+                if wide { kernel!("radix_scatter_parallel", SHARED_WIDE) } else { kernel!("radix_scatter_parallel") },
+            ]
+        } else {
+            [
+                kernel!("radix_count_sequential"),
+                kernel!("radix_scan_sequential"),
+                kernel!("radix_scatter_sequential"),
+            ]
+        };
         Ok(Self {
             parallel,
             count: Pipeline::new(gpu, count, &[])?,
@@ -79,28 +103,28 @@ impl RadixSort {
         })
     }
 
-    /// Memory for up to `n_max` keys of which the low `n_bits` count; `status[counter]` will hold how many there are.
-    pub fn buffers(&self, gpu: &Gpu, label: &str, n_max: u32, n_bits: u32, counter: u32) -> Result<SortBuffers, Error> {
+    /// Memory for up to `n_max` keys; `status[counter]` will hold how many there are, `status[largest]` the largest and the
+    /// next word the inverted least of those that are not all ones; all ones come last.
+    pub fn buffers(&self, gpu: &Gpu, label: &str, n_max: u32, counter: u32, largest: u32) -> Result<SortBuffers, Error> {
         let max_blocks = n_max.div_ceil(self.block()).max(1);
         let words = |name: &str, n: u32| gpu.storage(&format!("{label}.{name}"), 4 * u64::from(n.max(1)));
-        let digits = (0..n_bits.div_ceil(8))
-            .map(|pass| gpu.uniform_with("sort.digit", &Digit { shift: 8 * pass, counter, max_blocks, unused: 0 }));
+        let digits =
+            [0, 8].map(|shift| gpu.uniform_with("sort.digit", &Digit { shift, counter, largest, max_blocks }));
         Ok(SortBuffers {
             keys: [words("keys_a", n_max)?, words("keys_b", n_max)?],
             values: [words("values_a", n_max)?, words("values_b", n_max)?],
             counts: words("counts", 256 * max_blocks)?,
             totals: words("totals", 256)?,
-            digits: digits.collect(),
+            digits,
             max_blocks,
         })
     }
 
-    /// Sorts by the low `n_bits`; says which half of the buffers holds the result. The values become the places the
-    /// keys had before: what they held does not matter.
-    pub fn sort(&self, gpu: &Gpu, passes: &mut Passes, buffers: &SortBuffers, status: &Buffer, n_bits: u32) -> usize {
-        let n_passes = n_bits.div_ceil(8) as usize;
+    /// Sorts; keys and values end in the first half of the buffers. The values become the places the keys had before: what
+    /// they held does not matter.
+    pub fn sort(&self, gpu: &Gpu, passes: &mut Passes, buffers: &SortBuffers, status: &Buffer) {
         let n_groups = if self.parallel { buffers.max_blocks } else { buffers.max_blocks.div_ceil(8) };
-        for (pass, digit) in buffers.digits[..n_passes].iter().enumerate() {
+        for (pass, digit) in buffers.digits.iter().enumerate() {
             let (from, to) = (pass % 2, 1 - pass % 2);
             let keys = &buffers.keys[from];
             let base: [(&str, &Buffer); 3] = [("digit", digit), ("status", status), ("counts", &buffers.counts)];
@@ -116,12 +140,6 @@ impl RadixSort {
             }
             passes.dispatch(gpu, scatter, n_groups.into(), &scattered);
         }
-        self.half_after(n_bits)
-    }
-
-    /// Which half of the buffers holds the result of sorting by the low `n_bits`.
-    pub fn half_after(&self, n_bits: u32) -> usize {
-        n_bits.div_ceil(8) as usize % 2
     }
 
     fn block(&self) -> u32 {
@@ -134,7 +152,7 @@ mod tests {
     use super::*;
     use crate::gpu::GpuOptions;
 
-    fn sorted_on_gpu(keys: &[u32], n_bits: u32, parallel: bool) -> Option<(Vec<u32>, Vec<u32>)> {
+    fn sorted_on_gpu(keys: &[u32], ends: [u32; 2], parallel: bool) -> Option<(Vec<u32>, Vec<u32>)> {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
         if parallel && gpu.optional().subgroup_lanes.is_none_or(|lanes| lanes < 16) {
             eprintln!("skipped: the adapter has no subgroups of 16 or more");
@@ -142,27 +160,34 @@ mod tests {
         }
         let sort = RadixSort::of_form(&gpu, parallel).unwrap();
         let n = u32::try_from(keys.len()).unwrap();
-        let buffers = sort.buffers(&gpu, "test", n, n_bits, 0).unwrap();
-        let status = gpu.storage_with("status", bytemuck::cast_slice(&[n])).unwrap();
+        let buffers = sort.buffers(&gpu, "test", n, 0, 1).unwrap();
+        let status = gpu.storage_with("status", bytemuck::cast_slice(&[n, ends[1], !ends[0]])).unwrap();
         gpu.write(&buffers.keys[0], 0, bytemuck::cast_slice(keys));
         let mut passes = Passes::default();
-        let half = sort.sort(&gpu, &mut passes, &buffers, &status, n_bits);
+        sort.sort(&gpu, &mut passes, &buffers, &status);
         passes.submit(&gpu);
-        Some((gpu.read(&buffers.keys[half], keys.len()).unwrap(), gpu.read(&buffers.values[half], keys.len()).unwrap()))
+        Some((gpu.read(&buffers.keys[0], keys.len()).unwrap(), gpu.read(&buffers.values[0], keys.len()).unwrap()))
     }
 
-    fn check(n: u32, n_bits: u32, parallel: bool) {
-        let mask = if n_bits == 32 { u32::MAX } else { (1 << n_bits) - 1 };
-        let keys: Vec<u32> =
-            (0..n).map(|i| i.wrapping_mul(2_654_435_761).rotate_left(7) & mask & 0xf0ff_f0ff).collect();
+    fn check(n: u32, span: u32, parallel: bool) {
+        const LEAST: u32 = 1000;
+        let key = |i: u32| match i % 7 {
+            3 => u32::MAX,
+            _ => LEAST + i.wrapping_mul(2_654_435_761).rotate_left(7) % (span + 1),
+        };
+        let keys: Vec<u32> = (0..n).map(key).collect();
+        let counted = || keys.iter().copied().filter(|key| *key != u32::MAX);
+        let ends = [counted().min().unwrap(), counted().max().unwrap()];
+        let shift = (32 - (ends[1] - ends[0]).leading_zeros()).saturating_sub(16);
         let mut expected: Vec<(u32, u32)> = keys.iter().copied().zip(0..).collect();
-        expected.sort_by_key(|(key, _)| *key); // Stable, as the GPU's must be.
-        if let Some((sorted, places)) = sorted_on_gpu(&keys, n_bits, parallel) {
-            assert_eq!(
-                sorted.into_iter().zip(places).collect::<Vec<_>>(),
-                expected,
-                "{n} keys of {n_bits} bits, parallel {parallel}"
-            );
+        // Stable, as the GPU's must be.
+        expected.sort_by_key(|(key, _)| match *key {
+            u32::MAX => 0xffff,
+            key => ((key - ends[0]) >> shift).min(0xfffe),
+        });
+        if let Some((sorted, places)) = sorted_on_gpu(&keys, ends, parallel) {
+            let got: Vec<(u32, u32)> = sorted.into_iter().zip(places).collect();
+            assert_eq!(got, expected, "{n} keys over {span}, parallel {parallel}");
         }
     }
 
@@ -170,9 +195,10 @@ mod tests {
     fn sorts_stably_at_awkward_sizes() {
         for parallel in [false, true] {
             for n in [1, 255, 256, 257, 2049, 10_000] {
-                check(n, 32, parallel);
+                check(n, 50_000, parallel);
             }
-            check(70_000, 16, parallel);
+            check(70_000, 0xffff, parallel);
+            check(70_000, u32::MAX - 2000, parallel);
         }
     }
 }

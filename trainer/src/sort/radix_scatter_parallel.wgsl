@@ -8,6 +8,7 @@
 #import view
 #import digit
 #import scan
+#import peers
 
 @group(0) @binding(0) var<uniform> digit: Digit;
 @group(0) @binding(1) var<storage, read> status: array<u32>;
@@ -22,42 +23,13 @@ override VALUES_ARE_PLACES: bool = false; // The first pass of sorting 0, 1, 2, 
 const ROUNDS = 8u;
 var<workgroup> wg_ranks: array<atomic<u32>, 4096>; // [subgroup, digit]; subgroups have 16 lanes or more
 
-// Lanes of the subgroup whose digit is this lane's.
-fn peers_of(key_digit: u32, valid: bool) -> vec4u {
-    var peers = subgroupBallot(valid);
-    for (var bit = 0u; bit < 8u; bit++) {
-        let mine = (key_digit & (1u << bit)) != 0u;
-        let having = subgroupBallot(mine);
-        peers &= select(~having, having, vec4<bool>(mine));
-    }
-    return peers;
-}
-
-fn n_bits(mask: vec4u) -> u32 {
-    let n = countOneBits(mask);
-    return n.x + n.y + n.z + n.w;
-}
-
-// The lanes below `lane`.
-fn lanes_below(lane: u32) -> vec4u {
-    let first = vec4u(0u, 32u, 64u, 96u);
-    let n = clamp(vec4i(i32(lane)) - vec4i(first), vec4i(0), vec4i(32));
-    return select((vec4u(1u) << vec4u(n)) - vec4u(1u), vec4u(0xffffffffu), n == vec4i(32));
-}
-
-fn lowest_lane(mask: vec4u) -> u32 {
-    if mask.x != 0u { return firstTrailingBit(mask.x); }
-    if mask.y != 0u { return 32u + firstTrailingBit(mask.y); }
-    if mask.z != 0u { return 64u + firstTrailingBit(mask.z); }
-    return 96u + firstTrailingBit(mask.w);
-}
-
 @compute @workgroup_size(256)
 fn main(
     @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32,
     @builtin(subgroup_invocation_id) sub_lane: u32, @builtin(subgroup_size) sub_size: u32, @builtin(subgroup_id) subgroup: u32,
 ) {
     let n = status[digit.counter];
+    let cut = cut();
     let block = folded(wg, n_wgs);
     let n_subgroups = 256u / sub_size;
     for (var i = 0u; i < n_subgroups; i++) { atomicStore(&wg_ranks[i * 256u + lane], 0u); }
@@ -70,7 +42,7 @@ fn main(
         let at = first + round * sub_size;
         let valid = at < n;
         var key_digit = 0u;
-        if valid { key_digit = digit_of(keys[at]); }
+        if valid { key_digit = digit_of(keys[at], cut); }
         let peers = peers_of(key_digit, valid);
         let leader = lowest_lane(peers);
         var base = 0u;

@@ -29,6 +29,8 @@ fn main(@builtin(local_invocation_index) lane: u32) {
         status[NEED_ENTRIES] = max(status[NEED_ENTRIES], n_entries);
         status[NEED_SLOTS] = max(status[NEED_SLOTS], n_slots);
         let fits = n_entries <= capacity.n_entries && (n_slots <= capacity.n_slots || capacity.n_slots == 0u);
+        status[FURTHEST] = 0u; // For the next view; this one is sorted.
+        status[NEAREST] = 0u;
         status[N_ENTRIES] = select(0u, n_entries, fits);
         if !fits { status[FAILED] = 1u; }
     }

@@ -7,9 +7,6 @@ use crate::Error;
 use crate::gpu::{Buffer, Gpu};
 use crate::sort::SortBuffers;
 
-/// Bits of a depth key, as in project.wgsl.
-pub(crate) const DEPTH_BITS: u32 = 24;
-
 /// Splats of a block, neighbours in depth; bins a workgroup looks at; blocks of a group: as in shared/bins.wgsl.
 pub(crate) const BLOCK: u32 = 256;
 pub(crate) const WINDOW_BINS: u32 = 256;
@@ -240,7 +237,7 @@ impl Scratch {
             slot_offsets: words("splat.slot_offsets", n_splats)?,
             slot_begins: words("splat.slot_begins", n_splats)?,
             block_slots: words("splat.block_slots", n_blocks)?,
-            by_depth: pipelines.sort.buffers(gpu, "splat.by_depth", n_splats, DEPTH_BITS, status::N_SPLATS)?,
+            by_depth: pipelines.sort.buffers(gpu, "splat.by_depth", n_splats, status::N_SPLATS, status::FURTHEST)?,
             bin_counts: per_bin("splat.bin_counts", n_blocks)?,
             group_counts: per_bin("splat.group_counts", n_blocks.div_ceil(GROUP))?,
             bin_totals: words("splat.bin_totals", n_bins)?,

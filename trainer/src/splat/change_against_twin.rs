@@ -193,6 +193,10 @@ fn tiles_list_every_splat_that_reaches_them_in_order_of_depth() {
         masks.iter().zip(&slots).flat_map(|(tiles, slot)| *slot..*slot + tiles.count_ones()).collect();
     taken.sort_unstable();
     assert!(taken.iter().copied().eq(0..u32::try_from(taken.len()).unwrap()), "every slot has one owner");
+    // 16 bits over the range of depths: their octaves, each of as many steps.
+    let depths = || drawn.iter().map(|[place, ..]| place[2]).filter(|z| *z > 0.0);
+    let octaves = (depths().fold(0.0, f32::max) / depths().fold(f32::INFINITY, f32::min)).log2();
+    let key_step = (octaves + 1.0).log2().ceil().exp2() / 65536.0;
     let (mut n_listed, mut n_needless) = (0, 0);
     for tile in 0..n_tiles[0] * n_tiles[1] {
         let at = [tile % n_tiles[0], tile / n_tiles[0]];
@@ -201,8 +205,7 @@ fn tiles_list_every_splat_that_reaches_them_in_order_of_depth() {
         let entries = (starts[bin] as usize..starts[bin + 1] as usize).filter(|entry| masks[*entry] & bit != 0);
         let list: Vec<u32> = entries.map(|entry| splat_of[entry]).collect();
         let depths: Vec<f32> = list.iter().map(|ix| drawn[*ix as usize][0][2]).collect();
-        // Depth keys leave out the last three bits.
-        assert!(depths.windows(2).all(|pair| pair[0] <= pair[1] * (1.0 + 1e-6)), "tile {tile} is out of order");
+        assert!(depths.windows(2).all(|pair| pair[0] <= pair[1] * (1.0 + key_step)), "tile {tile} is out of order");
         let corner = [tile % n_tiles[0] * 16, tile / n_tiles[0] * 16];
         for (splat_ix, [place, conic, _]) in (0..).zip(&drawn) {
             let [a, b, c, reach] = conic.map(f64::from);

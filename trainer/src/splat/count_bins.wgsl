@@ -23,7 +23,7 @@
 @group(0) @binding(8) var<storage, read_write> block_slots: array<u32>;
 @group(0) @binding(9) var<storage, read_write> bin_counts: array<u32>;
 
-const UNSEEN = 0xffffffu; // As in project.
+const UNSEEN = 0xffffffffu; // As in project.
 @compute @workgroup_size(BLOCK)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let at = block_and_window(folded(wg, n_wgs), model.n_splats, view.n_tiles);

@@ -159,6 +159,7 @@ pub(crate) mod status {
     pub(crate) const NEED_SLOTS: usize = 5;
     pub(crate) const STEP: usize = 6;
     pub(crate) const N_POISONED: usize = 7;
+    pub(crate) const FURTHEST: u32 = 8;
     /// Length of the array.
     pub(crate) const LEN: usize = 16;
 }

@@ -1,6 +1,6 @@
 //! The stages of drawing and learning, as lists of passes.
 
-use super::buffers::{BLOCK, DEPTH_BITS, Frame, GROUP, Scratch, SplatBuffers, WINDOW_BINS, n_bins, n_tiles};
+use super::buffers::{BLOCK, Frame, GROUP, Scratch, SplatBuffers, WINDOW_BINS, n_bins, n_tiles};
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::params::Growth;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
@@ -119,17 +119,18 @@ impl ViewPasses<'_> {
                 ("sh_rest", &splats.sh_rest),
                 ("drawn", &scratch.drawn),
                 ("depth_keys", &scratch.by_depth.keys[0]),
+                ("status", status),
             ],
         );
-        let half = pipelines.sort.sort(gpu, passes, &scratch.by_depth, status, DEPTH_BITS);
-        let by_depth = ("by_depth", &scratch.by_depth.values[half]);
+        pipelines.sort.sort(gpu, passes, &scratch.by_depth, status);
+        let by_depth = ("by_depth", &scratch.by_depth.values[0]);
         let n_windows = u64::from(n_bins(size_px).div_ceil(WINDOW_BINS));
         let [drawn, tile_counts] = [("drawn", &scratch.drawn), ("tile_counts", &scratch.tile_counts)];
         let [bin_counts, group_counts] = [("bin_counts", &scratch.bin_counts), ("group_counts", &scratch.group_counts)];
         let [bin_totals, bin_starts] = [("bin_totals", &scratch.bin_totals), ("bin_starts", &scratch.bin_starts)];
         let [block_slots, status] = [("block_slots", &scratch.block_slots), ("status", status)];
         let [touched, slot_offsets] = [("touched", &scratch.touched), ("slot_offsets", &scratch.slot_offsets)];
-        let keys = ("depth_keys", &scratch.by_depth.keys[half]);
+        let keys = ("depth_keys", &scratch.by_depth.keys[0]);
         let counted =
             [view, model, keys, by_depth, drawn, touched, tile_counts, slot_offsets, block_slots, bin_counts];
         passes.dispatch(gpu, &pipelines.count_bins, n_blocks * n_windows, &counted);

@@ -2,7 +2,7 @@
 //
 // threads   one per splat
 // reads     view, model, means, rotations, shapes, sh_dc, sh_rest
-// writes    drawn [n_splats], depth_keys [n_splats] (24 bits; all ones where unseen)
+// writes    drawn [n_splats], depth_keys [n_splats] (all ones where unseen), status (nearest and furthest)
 // twin      splat/reference/project.rs
 // source    Zwicker et al. 2001 (EWA volume splatting); Kerbl et al. 2023, section 4
 
@@ -10,6 +10,7 @@
 #import model
 #import projection
 #import sh
+#import status
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> model: Model;
@@ -21,7 +22,10 @@
 @group(0) @binding(7) var<storage, read_write> drawn: array<Drawn>;
 @group(0) @binding(8) var<storage, read_write> depth_keys: array<u32>;
 
-const UNSEEN = 0xffffffu;
+@group(0) @binding(9) var<storage, read_write> status: array<atomic<u32>>;
+
+const UNSEEN = 0xffffffffu;
+var<workgroup> wg_ends: array<vec2u, 256>;
 
 struct ShSums {
     splat_ix: u32,
@@ -33,20 +37,16 @@ fn sh_term(sums: ptr<function, ShSums>, k: u32, basis: f32, slope: vec3f) {
     (*sums).color += basis * vec3f(sh_rest[at], sh_rest[at + model.capacity], sh_rest[at + 2u * model.capacity]);
 }
 
-override WG_SIZE = 256u;
-@compute @workgroup_size(WG_SIZE)
-fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
-    let splat_ix = folded(wg, n_wgs) * WG_SIZE + lane;
-    if splat_ix >= model.n_splats { return; } // Allowed here: no barrier, no subgroup operation below.
+// Places and colors a splat; its depth key.
+fn draw(splat_ix: u32) -> u32 {
     let mean = means[splat_ix].xyz;
     let shape = shapes[splat_ix];
     let projection = project_splat(view, mean, rotations[splat_ix], shape.xyz);
     let opacity = sigmoid(shape.w);
-    depth_keys[splat_ix] = UNSEEN;
     // Written so that a NaN anywhere is not seen.
     let seen = projection.seen && opacity > MIN_ALPHA && projection.determinant > 0.0 && inside_crop(view, mean)
         && abs(projection.mean_px.x) < 1e6 && abs(projection.mean_px.y) < 1e6 && projection.covariance.x + projection.covariance.z < 1e12;
-    if !seen { return; }
+    if !seen { return UNSEEN; }
 
     let conic = vec3f(projection.covariance.z, -projection.covariance.y, projection.covariance.x) / projection.determinant;
     let reach = 2.0 * log(255.0 * opacity);
@@ -54,15 +54,32 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let half_px = sqrt(max(vec2f(reach) * projection.covariance.xz, vec2f(0.0))) + 0.5;
     let last = projection.mean_px + half_px;
     let first = projection.mean_px - half_px;
-    if any(last < vec2f(0.0)) || any(first > vec2f(view.size_px)) { return; }
+    if any(last < vec2f(0.0)) || any(first > vec2f(view.size_px)) { return UNSEEN; }
 
     let constant = vec3f(sh_dc[splat_ix], sh_dc[model.capacity + splat_ix], sh_dc[2u * model.capacity + splat_ix]);
     var sums = ShSums(splat_ix, vec3f(0.5) + SH_0 * constant);
     each_sh(&sums, normalize(mean - view.center_in_world.xyz), model.sh_degree);
     let color = max(sums.color, vec3f(0.0));
     drawn[splat_ix] = Drawn(vec4f(projection.mean_px, projection.point.z, opacity), vec4f(conic, reach), vec4f(color, 0.0));
-    // Positive floats order as their bits do. Counted from the near plane, without the last three, a millionth of the depth
-    // and sixteen octaves fit; what is further comes last, in the order of the splats.
-    let beyond_near = bitcast<u32>(projection.point.z) - bitcast<u32>(view.shutter_linear.w);
-    depth_keys[splat_ix] = min(beyond_near >> 3u, UNSEEN - 1u);
+    return bitcast<u32>(projection.point.z); // Positive floats order as their bits do.
+}
+
+@compute @workgroup_size(256)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let splat_ix = folded(wg, n_wgs) * 256u + lane;
+    var key = UNSEEN;
+    if splat_ix < model.n_splats {
+        key = draw(splat_ix);
+        depth_keys[splat_ix] = key;
+    }
+    wg_ends[lane] = select(vec2u(key, ~key), vec2u(0u), key == UNSEEN);
+    workgroupBarrier(); // All ends are there.
+    for (var stride = 128u; stride > 0u; stride /= 2u) {
+        if lane < stride { wg_ends[lane] = max(wg_ends[lane], wg_ends[lane + stride]); }
+        workgroupBarrier(); // This half holds what the other knew.
+    }
+    if lane == 0u {
+        atomicMax(&status[FURTHEST], wg_ends[0].x);
+        atomicMax(&status[NEAREST], wg_ends[0].y);
+    }
 }
