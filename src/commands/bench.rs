@@ -5,6 +5,7 @@ use clap::{Parser, Subcommand};
 use serde::Serialize;
 use std::io::Write;
 use std::path::PathBuf;
+use std::time::Duration;
 use trainer::splat::arrays::SplatArrays;
 use trainer::splat::bench::{Repeats, time_kernels};
 use trainer::splat::cloud::{load_cloud_npz, synthetic_cloud};
@@ -120,7 +121,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
                     &made
                 }
             };
-            let repeats = Repeats { n_warm_up: n_repeats.div_ceil(3), n_timed: n_repeats, n_row: 3 * n_repeats };
+            let repeats = Repeats {
+                n_warm_up: n_repeats.div_ceil(3),
+                warm_up: Duration::from_millis(300),
+                n_timed: n_repeats,
+                n_row: 3 * n_repeats,
+            };
             let figures = time_kernels(&gpu, cloud, *size, repeats).with_context(|| {
                 format!("{}x{} pixels and {n_splats} splats: try fewer --splats or a smaller --size", size[0], size[1])
             })?;

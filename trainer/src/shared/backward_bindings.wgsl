@@ -10,15 +10,13 @@
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> status: array<u32>;
 @group(0) @binding(2) var<storage, read> bin_starts: array<u32>;
-@group(0) @binding(3) var<storage, read> entry_tiles: array<u32>;
-@group(0) @binding(4) var<storage, read> entry_splats: array<u32>;
-@group(0) @binding(5) var<storage, read> entry_slots: array<u32>;
-@group(0) @binding(6) var<storage, read> drawn: array<Drawn>;
-@group(0) @binding(7) var<storage, read> upstream: array<vec4f>;
-@group(0) @binding(8) var<storage, read> rest: array<vec2f>;
-@group(0) @binding(9) var<storage, read> last: array<u32>;
-@group(0) @binding(10) var<storage, read> tile_bits: array<u32>;
-@group(0) @binding(11) var<storage, read_write> gradients: array<f32>; // 12 a slot, see `Gradient`
+@group(0) @binding(3) var<storage, read> tile_bits: array<u32>;
+@group(0) @binding(4) var<storage, read> entries: array<vec4u>; // splat, tiles, slot
+@group(0) @binding(5) var<storage, read> drawn: array<Drawn>;
+@group(0) @binding(6) var<storage, read> upstream: array<vec4f>;
+@group(0) @binding(7) var<storage, read> rest: array<vec2f>;
+@group(0) @binding(8) var<storage, read> last: array<u32>;
+@group(0) @binding(9) var<storage, read_write> gradients: array<f32>; // 12 a slot, see `Gradient`
 
 const N_PARTS_OF_GRADIENT = 12u;
 
@@ -57,7 +55,7 @@ fn pixels_at(tile: Tile, first: vec2u) -> Pixels {
 //
 // Behind a splat lies `rest` minus what lies in front of it, so one number a pixel goes along beside the transmittance.
 fn passed(pixels: ptr<function, Pixels>, hit: PxB, power: Px, dx: Px, dy: f32, splat: Drawn) -> Gradient {
-    let falloff = select(Px(0.0), exp(-power), hit);
+    let falloff = select(Px(0.0), exp2(-power), hit);
     let unclamped = splat.place.w * falloff;
     let alpha = min(Px(MAX_ALPHA), unclamped);
     let weight = alpha * (*pixels).transmittance;
@@ -79,11 +77,11 @@ fn passed(pixels: ptr<function, Pixels>, hit: PxB, power: Px, dx: Px, dy: f32, s
     );
 }
 
-// From the sums of `passed` to the gradient.
-fn finished(sum: Gradient, conic: vec4f) -> Gradient {
-    let moved = sum.place.xy;
+// From the sums of `passed` to the gradient; see `halved`.
+fn finished(sum: Gradient, half: vec4f) -> Gradient {
+    let moved = LN_2 * sum.place.xy;
     return Gradient(
-        vec4f(conic.x * moved.x + conic.y * moved.y, conic.y * moved.x + conic.z * moved.y, sum.place.zw),
+        vec4f(2.0 * half.x * moved.x + half.y * moved.y, half.y * moved.x + 2.0 * half.z * moved.y, sum.place.zw),
         vec4f(0.5 * sum.conic.x, sum.conic.y, 0.5 * sum.conic.z, sum.conic.w),
         sum.color,
     );
@@ -91,5 +89,5 @@ fn finished(sum: Gradient, conic: vec4f) -> Gradient {
 
 // Where the gradients of a tile's entry go.
 fn slot_of(entry: u32, tile: Tile) -> u32 {
-    return entry_slots[entry] + countOneBits(entry_tiles[entry] & ((1u << tile.in_bin) - 1u));
+    return entries[entry].z + countOneBits(entries[entry].y & ((1u << tile.in_bin) - 1u));
 }

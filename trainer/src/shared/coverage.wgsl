@@ -1,12 +1,20 @@
 // coverage: how a splat covers a lane's pixels. After `pixels`.
 
-// Half the squared distance in standard deviations; `offset` from pixel to splat.
-fn power_at(conic: vec4f, dx: Px, dy: f32) -> Px {
-    return 0.5 * (conic.x * dx * dx + conic.z * dy * dy) + conic.y * dy * dx;
+const LN_2 = 0.6931471805599453;
+
+// A conic as the pixels need it: its quadratic form gives the falloff as a power of 2; w: the largest power drawn.
+fn halved(conic: vec4f) -> vec4f {
+    return conic * vec4f(0.5, 1.0, 0.5, 0.5) / LN_2;
 }
 
-fn within_reach(conic: vec4f, power: Px) -> PxB {
-    return (power >= Px(0.0)) & (power <= Px(0.5 * conic.w));
+// The falloff is 2 to minus this; `offset` from pixel to splat.
+fn power_at(half: vec4f, dx: Px, dy: f32) -> Px {
+    return (half.x * dx + half.y * dy) * dx + half.z * dy * dy;
+}
+
+// From 0 to the largest: as integers, negative numbers and NaN lie above.
+fn within_reach(half: vec4f, power: Px) -> PxB {
+    return bitcast<PxU>(power) <= PxU(bitcast<u32>(half.w));
 }
 
 // A lane's pixels and what lies in front of the splat at hand.
@@ -27,7 +35,7 @@ fn unblended(live: PxB) -> Blend {
 // Blends in a splat where it reaches; `hit` is what it reaches, `rank` its place in the bin's list.
 fn blended(before: Blend, hit: PxB, power: Px, opacity_and_depth: vec2f, color: vec3f, rank: u32) -> Blend {
     var after = before;
-    let alpha = min(Px(MAX_ALPHA), opacity_and_depth.x * exp(-power));
+    let alpha = min(Px(MAX_ALPHA), opacity_and_depth.x * exp2(-power));
     let next = before.transmittance * (1.0 - alpha);
     let goes_on = next > Px(MIN_TRANSMITTANCE);
     let adds = hit & goes_on;

@@ -3,7 +3,7 @@
 struct Tile {
     in_grid: bool,
     corner: vec2u,     // pixels
-    in_bin: u32,       // its own bit in entry_tiles, its plane of tile_bits
+    in_bin: u32,       // its own bit in the entries' masks, its plane of tile_bits
     begin: u32,        // of the bin's list
     end: u32,
 }

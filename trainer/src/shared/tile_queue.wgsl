@@ -7,10 +7,10 @@
 
 const LANES = 32u;
 const BATCH = LANES;
-const WORDS = 16u;         // of 32 entries, looked through at once
+const WORDS = 8u;          // of 32 entries, looked through at once
 var<workgroup> wg_words: array<u32, WORDS>;
-var<workgroup> wg_queue: array<u32, 512>;
-var<workgroup> wg_drawn: array<Drawn, BATCH>;  // color.w: bits of the rank in the bin's list
+var<workgroup> wg_queue: array<u32, 256>;
+var<workgroup> wg_drawn: array<Drawn, BATCH>;  // conic: `halved`; color.w: bits of the rank in the bin's list
 var<workgroup> wg_quarters: array<u32, BATCH>; // that the splat may touch, see `quarters_touched`
 
 // Where in its quarter the lane's first pixel lies.
@@ -22,19 +22,17 @@ fn lane_px(lane: u32) -> vec2u {
 fn queue_words(lane: u32, first: u32, tile: Tile) -> u32 {
     if lane < WORDS { wg_words[lane] = entries_of(tile, first + lane); }
     workgroupBarrier(); // The words are there, and nobody reads the queue any more.
-    // Two lanes a word.
-    let mine = lane / 2u;
+    // Four lanes a word.
+    let mine = lane / 4u;
+    let shift = lane % 4u * 8u;
     var n = 0u;
     var at = 0u;
     for (var word = 0u; word < WORDS; word++) {
         if word == mine { at = n; }
         n += countOneBits(wg_words[word]);
     }
-    var bits = wg_words[mine] & 0xffffu;
-    if lane % 2u == 1u {
-        at += countOneBits(bits);
-        bits = wg_words[mine] & 0xffff0000u;
-    }
+    at += countOneBits(wg_words[mine] & ((1u << shift) - 1u));
+    var bits = wg_words[mine] & (255u << shift);
     while bits != 0u {
         wg_queue[at] = (first + mine) * 32u + firstTrailingBit(bits);
         bits &= bits - 1u;
@@ -49,10 +47,11 @@ fn take_batch(lane: u32, batch: u32, n_queued: u32, tile: Tile) {
     workgroupBarrier(); // Nobody reads the last batch any more.
     if batch + lane < n_queued {
         let entry = wg_queue[batch + lane];
-        var splat = drawn[entry_splats[entry]];
+        var splat = drawn[entries[entry].x];
         splat.color.w = bitcast<f32>(entry - tile.begin);
-        wg_drawn[lane] = splat;
         wg_quarters[lane] = quarters_touched(Ellipse(splat.place.xy, splat.conic.xyz, splat.conic.w), vec2f(tile.corner));
+        splat.conic = halved(splat.conic);
+        wg_drawn[lane] = splat;
     }
     workgroupBarrier(); // The batch is there.
 }

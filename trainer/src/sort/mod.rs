@@ -88,11 +88,7 @@ impl RadixSort {
                 if wide { kernel!("radix_scatter_parallel", SHARED_WIDE) } else { kernel!("radix_scatter_parallel") },
             ]
         } else {
-            [
-                kernel!("radix_count_sequential"),
-                kernel!("radix_scan_sequential"),
-                kernel!("radix_scatter_sequential"),
-            ]
+            [kernel!("radix_count_sequential"), kernel!("radix_scan_sequential"), kernel!("radix_scatter_sequential")]
         };
         Ok(Self {
             parallel,
@@ -105,11 +101,17 @@ impl RadixSort {
 
     /// Memory for up to `n_max` keys; `status[counter]` will hold how many there are, `status[largest]` the largest and the
     /// next word the inverted least of those that are not all ones; all ones come last.
-    pub fn buffers(&self, gpu: &Gpu, label: &str, n_max: u32, counter: u32, largest: u32) -> Result<SortBuffers, Error> {
+    pub fn buffers(
+        &self,
+        gpu: &Gpu,
+        label: &str,
+        n_max: u32,
+        counter: u32,
+        largest: u32,
+    ) -> Result<SortBuffers, Error> {
         let max_blocks = n_max.div_ceil(self.block()).max(1);
         let words = |name: &str, n: u32| gpu.storage(&format!("{label}.{name}"), 4 * u64::from(n.max(1)));
-        let digits =
-            [0, 8].map(|shift| gpu.uniform_with("sort.digit", &Digit { shift, counter, largest, max_blocks }));
+        let digits = [0, 8].map(|shift| gpu.uniform_with("sort.digit", &Digit { shift, counter, largest, max_blocks }));
         Ok(SortBuffers {
             keys: [words("keys_a", n_max)?, words("keys_b", n_max)?],
             values: [words("values_a", n_max)?, words("values_b", n_max)?],

@@ -73,9 +73,12 @@ impl Bench {
         let mut splats = SplatBuffers::new(&gpu, n_splats, 3).unwrap();
         splats.append(&gpu, arrays);
         let tiles = n_tiles(view.size_px);
-        let scratch =
-            Scratch::new(&gpu, &draw, ScratchSize { n_splats, n_entries: 1 << 14, n_slots: 1 << 14, n_bins: n_bins(view.size_px) })
-                .unwrap();
+        let scratch = Scratch::new(
+            &gpu,
+            &draw,
+            ScratchSize { n_splats, n_entries: 1 << 14, n_slots: 1 << 14, n_bins: n_bins(view.size_px) },
+        )
+        .unwrap();
         let frame = Frame::new(&gpu, view.size_px[0] * view.size_px[1], tiles, true).unwrap();
         let mut counters = [0u32; status::LEN];
         counters[status::N_SPLATS as usize] = n_splats;

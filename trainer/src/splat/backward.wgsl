@@ -1,7 +1,7 @@
 // backward: the gradient of every intersection of splat and tile.
 //
 // threads   32 per tile, two pixels in each of its quarters a lane
-// reads     view, status, bin_starts, tile_bits, entry_tiles, entry_splats, entry_slots, drawn, upstream [n_pixels] (slope towards rgb
+// reads     view, status, bin_starts, tile_bits, entries, drawn, upstream [n_pixels] (slope towards rgb
 //           and depth), rest [n_pixels] (color . v_color + depth v_depth + transmittance v_transmittance of the finished
 //           pixel; y: absolute error), last
 // writes    gradients [n_slots]: every slot by its only owner

@@ -26,6 +26,7 @@ var<workgroup> wg_between: array<Between, 64>; // [N_STRIPS, LANES]
 struct Owned {
     entry: u32,        // past the list where the lane has none
     splat: Drawn,
+    half: vec4f,       // its conic, `halved`
     sum: Gradient,     // still before `finished`
 }
 
@@ -35,7 +36,8 @@ fn owned_splat(at: u32, n_queued: u32) -> Owned {
     own.splat.conic.w = -1.0; // Reaches nothing.
     if at < n_queued {
         own.entry = wg_queue[at];
-        own.splat = drawn[entry_splats[own.entry]];
+        own.splat = drawn[entries[own.entry].x];
+        own.half = halved(own.splat.conic);
     }
     return own;
 }
@@ -59,7 +61,7 @@ fn pass_strip(lane: u32, own: ptr<function, Owned>, strip: Strip, pixels: ptr<fu
         let some = reaching != 0u; // The loop's body runs at least once.
         let i = firstTrailingBit(reaching) & 7u;
         reaching &= reaching - 1u;
-        let passing = Drawn(subgroupShuffle(splat.place, i), subgroupShuffle(splat.conic, i), subgroupShuffle(splat.color, i));
+        let passing = Drawn(subgroupShuffle(splat.place, i), subgroupShuffle((*own).half, i), subgroupShuffle(splat.color, i));
         let dx = passing.place.x - strip.center_x;
         let dy = passing.place.y - strip.center_y;
         let power = power_at(passing.conic, dx, dy);
@@ -77,7 +79,7 @@ fn pass_strip(lane: u32, own: ptr<function, Owned>, strip: Strip, pixels: ptr<fu
 
 fn hand_in(own: Owned, tile: Tile) {
     if own.entry == 0xffffffffu { return; }
-    let sum = finished(own.sum, own.splat.conic);
+    let sum = finished(own.sum, own.half);
     let at = slot_of(own.entry, tile) * N_PARTS_OF_GRADIENT;
     for (var k = 0u; k < 4u; k++) {
         gradients[at + k] = sum.place[k];

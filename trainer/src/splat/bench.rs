@@ -12,7 +12,7 @@ use crate::Error;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, f32_of};
 use kinematics::Transform;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// Learning rate of every parameter: small, so that the cloud stays the cloud.
 const RATE: f32 = 1e-5;
@@ -41,8 +41,10 @@ pub struct KernelFigures {
 /// How often things are repeated.
 #[derive(Clone, Copy, Debug)]
 pub struct Repeats {
-    /// Before the clock starts.
+    /// Before the clock starts, at least.
     pub n_warm_up: usize,
+    /// Likewise, where a hundred times as many fit into it.
+    pub warm_up: Duration,
     /// With timestamps.
     pub n_timed: usize,
     /// Back to back for the wall clock.
@@ -153,11 +155,8 @@ impl KernelBench {
                 n_bins: n_bins(self.size_px),
             };
             drop(passes);
-            self.scratch = Scratch::new(
-                &self.gpu,
-                &self.draw,
-                ScratchSize { n_splats: 1, n_entries: 1, n_slots: 1, n_bins: 1 },
-            )?;
+            self.scratch =
+                Scratch::new(&self.gpu, &self.draw, ScratchSize { n_splats: 1, n_entries: 1, n_slots: 1, n_bins: 1 })?;
             self.scratch = Scratch::new(&self.gpu, &self.draw, size)?;
             self.gpu.write(&self.status, 4 * status::FAILED as u64, &[0; 12]);
         }
@@ -194,11 +193,22 @@ impl KernelBench {
     }
 
     fn time(&self, passes: &mut Passes, repeats: Repeats, list: fn(&Self, &mut Passes)) -> Result<(f64, f64), Error> {
-        for _ in 0..repeats.n_warm_up {
+        // For tenths of a second after large buffers were freed, some GPUs are busy with them.
+        let warming = Instant::now();
+        let mut n_warm = 0;
+        while n_warm < repeats.n_warm_up || (warming.elapsed() < repeats.warm_up && n_warm < 100 * repeats.n_warm_up) {
+            list(self, passes);
+            passes.submit(&self.gpu);
+            self.gpu.wait()?;
+            n_warm += 1;
+        }
+        let since = Instant::now();
+        for _ in 0..repeats.n_row {
             list(self, passes);
             passes.submit(&self.gpu);
         }
         self.gpu.wait()?;
+        let row_millis = since.elapsed().as_secs_f64() * 1e3 / repeats.n_row as f64;
         let mut spans = Vec::new();
         for _ in 0..repeats.n_timed {
             list(self, passes);
@@ -207,13 +217,7 @@ impl KernelBench {
             spans.push(span.unwrap_or_else(|| since.elapsed().as_secs_f64() * 1e3));
         }
         spans.sort_by(f64::total_cmp);
-        let since = Instant::now();
-        for _ in 0..repeats.n_row {
-            list(self, passes);
-            passes.submit(&self.gpu);
-        }
-        self.gpu.wait()?;
-        Ok((spans[spans.len() / 2], since.elapsed().as_secs_f64() * 1e3 / repeats.n_row as f64))
+        Ok((spans[spans.len() / 2], row_millis))
     }
 
     fn counters(&self) -> Result<Vec<u32>, Error> {

@@ -204,9 +204,7 @@ pub(crate) struct Scratch {
     pub(crate) group_counts: Buffer,
     pub(crate) bin_totals: Buffer,
     pub(crate) bin_starts: Buffer,
-    pub(crate) entry_tiles: Buffer,
-    pub(crate) entry_splats: Buffer,
-    pub(crate) entry_slots: Buffer,
+    pub(crate) entries: Buffer,
     pub(crate) tile_bits: Buffer,
     pub(crate) gradients: Buffer,
 }
@@ -242,9 +240,7 @@ impl Scratch {
             group_counts: per_bin("splat.group_counts", n_blocks.div_ceil(GROUP))?,
             bin_totals: words("splat.bin_totals", n_bins)?,
             bin_starts: words("splat.bin_starts", n_bins + 1)?,
-            entry_tiles: words("splat.entry_tiles", n_entries)?,
-            entry_splats: words("splat.entry_splats", n_entries)?,
-            entry_slots: words("splat.entry_slots", n_entries)?,
+            entries: gpu.storage("splat.entries", 16 * u64::from(n_entries.max(1)))?,
             tile_bits: gpu.storage("splat.tile_bits", 64 * u64::from(n_entries.div_ceil(32).max(1)))?,
             gradients: gpu.storage("splat.gradients", 48 * u64::from(n_slots))?,
         })

@@ -172,6 +172,10 @@ fn growth_matches_the_twin() {
     check(&splats_of(&bench.splats.read(&gpu).unwrap()), &expected.splats, [2e-5, 2e-4, 1e-6, 1e-3, 1e-6]);
 }
 
+fn column(entries: &[[u32; 4]], part: usize) -> Vec<u32> {
+    entries.iter().map(|entry| entry[part]).collect()
+}
+
 /// Bins by hand: a splat belongs to a tile when it reaches one of its pixels.
 #[test]
 fn tiles_list_every_splat_that_reaches_them_in_order_of_depth() {
@@ -187,8 +191,8 @@ fn tiles_list_every_splat_that_reaches_them_in_order_of_depth() {
     let n_bins = n_tiles.map(|n| n.div_ceil(4));
     let starts: Vec<u32> = gpu.read(&bench.scratch.bin_starts, (n_bins[0] * n_bins[1]) as usize + 1).unwrap();
     let n_entries = starts[starts.len() - 1] as usize;
-    let [masks, splat_of, slots] = [&bench.scratch.entry_tiles, &bench.scratch.entry_splats, &bench.scratch.entry_slots]
-        .map(|buffer| gpu.read::<u32>(buffer, n_entries).unwrap());
+    let entries: Vec<[u32; 4]> = gpu.read(&bench.scratch.entries, n_entries).unwrap();
+    let (splat_of, masks, slots) = (column(&entries, 0), column(&entries, 1), column(&entries, 2));
     let mut taken: Vec<u32> =
         masks.iter().zip(&slots).flat_map(|(tiles, slot)| *slot..*slot + tiles.count_ones()).collect();
     taken.sort_unstable();

@@ -2,8 +2,7 @@
 //
 // threads   256 per block of 256 splats, taken in order of depth, and window of 256 bins
 // reads     view, model, by_depth, touched, bin_counts, group_counts (offsets), bin_starts, slot_offsets, block_slots, status
-// writes    entry_tiles [n_entries] (mask of the bin's tiles), entry_splats [n_entries], entry_slots [n_entries] (of the
-//           lowest tile; the others follow), slot_begins [n_splats]
+// writes    entries [n_entries] (splat; mask of the bin's tiles; slot of the lowest, the others follow), slot_begins [n_splats]
 
 #import view
 #import model
@@ -21,10 +20,8 @@
 @group(0) @binding(7) var<storage, read> slot_offsets: array<u32>;
 @group(0) @binding(8) var<storage, read> block_slots: array<u32>;
 @group(0) @binding(9) var<storage, read> status: array<u32>;
-@group(0) @binding(10) var<storage, read_write> entry_tiles: array<u32>;
-@group(0) @binding(11) var<storage, read_write> entry_splats: array<u32>;
-@group(0) @binding(12) var<storage, read_write> entry_slots: array<u32>;
-@group(0) @binding(13) var<storage, read_write> slot_begins: array<u32>;
+@group(0) @binding(10) var<storage, read_write> entries: array<vec4u>;
+@group(0) @binding(11) var<storage, read_write> slot_begins: array<u32>;
 
 var<workgroup> wg_begins: array<u32, WINDOW_BINS>; // of the block's entries of a bin
 
@@ -39,8 +36,8 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         let bin = at.first_bin + lane;
         var begin = bin_starts[bin] + group_counts[at.block / GROUP * n_bins + bin];
         for (var i = 0u; i + 1u < GROUP; i++) {
-            let block = at.block / GROUP * GROUP + i;
-            if block < at.block { begin += bin_counts[block * n_bins + bin]; }
+            let block = min(at.block / GROUP * GROUP + i, at.block); // Its own, which does not count, where none is left.
+            begin += select(0u, bin_counts[block * n_bins + bin], block < at.block);
         }
         wg_begins[lane] = begin;
     }
@@ -55,10 +52,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
             let tiles = tiles_in_bin(touches, column, row);
             let bin = row * at.bins.x + column - at.first_bin; // Wraps where the bin is before the window.
             if bin < at.n_bins && tiles != 0u {
-                let entry = wg_begins[bin] + n_marked(bin, lane);
-                entry_tiles[entry] = tiles;
-                entry_splats[entry] = splat_ix;
-                entry_slots[entry] = slot;
+                entries[wg_begins[bin] + n_marked(bin, lane)] = vec4u(splat_ix, tiles, slot, 0u);
             }
             slot += countOneBits(tiles);
         }

@@ -46,16 +46,10 @@ macro_rules! blend_sources {
         ]
     };
 }
-const BLEND: &[Source] = blend_sources!(
-    source!("pixels", "pixels_2"),
-    source!("tile_queue"),
-    source!("sums", "sums_subgroup")
-);
-const BLEND_BY_MEMORY: &[Source] = blend_sources!(
-    source!("pixels", "pixels_2"),
-    source!("tile_queue"),
-    source!("sums", "sums_memory")
-);
+const BLEND: &[Source] =
+    blend_sources!(source!("pixels", "pixels_2"), source!("tile_queue"), source!("sums", "sums_subgroup"));
+const BLEND_BY_MEMORY: &[Source] =
+    blend_sources!(source!("pixels", "pixels_2"), source!("tile_queue"), source!("sums", "sums_memory"));
 const BLEND_STRIPS: &[Source] = blend_sources!(source!("pixels", "pixels_4"), source!("strips"));
 
 macro_rules! kernel {
@@ -89,9 +83,11 @@ fn blend(gpu: &Gpu) -> Blend {
             backward: kernel!("backward_strips", BLEND_STRIPS),
             subgroup: None,
         },
-        Some(lanes) if (16..=128).contains(&lanes) => {
-            Blend { rasterize: kernel!("rasterize", BLEND), backward: kernel!("backward", BLEND), subgroup: Some(lanes) }
-        }
+        Some(lanes) if (16..=128).contains(&lanes) => Blend {
+            rasterize: kernel!("rasterize", BLEND),
+            backward: kernel!("backward", BLEND),
+            subgroup: Some(lanes),
+        },
         _ => Blend {
             rasterize: kernel!("rasterize", BLEND),
             backward: kernel!("backward", BLEND_BY_MEMORY),

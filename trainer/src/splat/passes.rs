@@ -131,8 +131,7 @@ impl ViewPasses<'_> {
         let [block_slots, status] = [("block_slots", &scratch.block_slots), ("status", status)];
         let [touched, slot_offsets] = [("touched", &scratch.touched), ("slot_offsets", &scratch.slot_offsets)];
         let keys = ("depth_keys", &scratch.by_depth.keys[0]);
-        let counted =
-            [view, model, keys, by_depth, drawn, touched, tile_counts, slot_offsets, block_slots, bin_counts];
+        let counted = [view, model, keys, by_depth, drawn, touched, tile_counts, slot_offsets, block_slots, bin_counts];
         passes.dispatch(gpu, &pipelines.count_bins, n_blocks * n_windows, &counted);
         let n_groups = n_blocks.div_ceil(u64::from(GROUP));
         passes.dispatch(gpu, &pipelines.sum_bins, n_groups * n_windows, &[view, model, bin_counts, group_counts]);
@@ -140,8 +139,7 @@ impl ViewPasses<'_> {
         passes.dispatch(gpu, &pipelines.scan_bins, u64::from(n_bins(size_px)), &scanned);
         let allocated = [view, model, ("capacity", &scratch.capacity), bin_totals, bin_starts, block_slots, status];
         passes.dispatch(gpu, &pipelines.allocate, 1, &allocated);
-        let [entry_tiles, entry_splats] =
-            [("entry_tiles", &scratch.entry_tiles), ("entry_splats", &scratch.entry_splats)];
+        let entries = ("entries", &scratch.entries);
         let emitted = [
             view,
             model,
@@ -153,15 +151,13 @@ impl ViewPasses<'_> {
             slot_offsets,
             block_slots,
             status,
-            entry_tiles,
-            entry_splats,
-            ("entry_slots", &scratch.entry_slots),
+            entries,
             ("slot_begins", &scratch.slot_begins),
         ];
         passes.dispatch(gpu, &pipelines.emit, n_blocks * n_windows, &emitted);
         let tile_bits = ("tile_bits", &scratch.tile_bits);
         let n_groups = u64::from(scratch.n_entries.div_ceil(512));
-        passes.dispatch(gpu, &pipelines.tile_bits, n_groups, &[status, entry_tiles, tile_bits]);
+        passes.dispatch(gpu, &pipelines.tile_bits, n_groups, &[status, entries, tile_bits]);
         passes.dispatch(
             gpu,
             &pipelines.rasterize,
@@ -171,7 +167,7 @@ impl ViewPasses<'_> {
                 status,
                 bin_starts,
                 tile_bits,
-                entry_splats,
+                entries,
                 drawn,
                 ("image", &frame.image),
                 ("depth", &frame.depth),
@@ -243,9 +239,7 @@ impl ViewPasses<'_> {
                 ("status", status),
                 ("bin_starts", &scratch.bin_starts),
                 ("tile_bits", &scratch.tile_bits),
-                ("entry_tiles", &scratch.entry_tiles),
-                ("entry_splats", &scratch.entry_splats),
-                ("entry_slots", &scratch.entry_slots),
+                ("entries", &scratch.entries),
                 ("drawn", &scratch.drawn),
                 ("upstream", &frame.upstream),
                 ("rest", &frame.rest),

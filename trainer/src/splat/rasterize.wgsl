@@ -1,7 +1,7 @@
 // rasterize: blend each tile's splats front to back.
 //
 // threads   32 per tile, two pixels in each of its quarters a lane
-// reads     view, status, bin_starts, tile_bits, entry_splats, drawn
+// reads     view, status, bin_starts, tile_bits, entries, drawn
 // writes    image [n_pixels] (premultiplied rgb, transmittance), depth [n_pixels] (premultiplied), last [n_pixels]
 //           (past the last contributor, counted from the first of the bin's list)
 // twin      splat/reference/rasterize.rs
@@ -20,7 +20,7 @@ var<workgroup> wg_all_done: u32;
 fn blend_in(blend: ptr<function, Blend>, splat: Drawn, dx: Px, dy: f32) {
     let power = power_at(splat.conic, dx, dy);
     let hit = (*blend).live & within_reach(splat.conic, power);
-    if any(hit) { *blend = blended(*blend, hit, power, splat.place.wz, splat.color.rgb, bitcast<u32>(splat.color.w)); }
+    *blend = blended(*blend, hit, power, splat.place.wz, splat.color.rgb, bitcast<u32>(splat.color.w));
 }
 
 fn on_image(tile: Tile, first: vec2u) -> PxB {

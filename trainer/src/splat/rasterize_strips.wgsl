@@ -33,10 +33,11 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
             var any_live = queued.x > 0u && or_of_lanes(select(0u, 1u, any(blend.live))) != 0u;
             for (var part = 0u; part < queued.x && any_live; part += LANES) {
                 let entry = wg_queue[min(part + lane, queued.x - 1u)];
-                let splat_ix = entry_splats[entry];
+                let splat_ix = entries[entry].x;
                 let place = drawn[splat_ix].place;
                 let conic = drawn[splat_ix].conic;
                 let color = drawn[splat_ix].color;
+                let half = halved(conic);
                 let owned = part + lane < queued.x;
                 var reaching = or_of_lanes(select(0u, 1u << lane, owned && reaches_strip(place, conic, top)));
                 loop {
@@ -44,7 +45,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
                     let i = firstTrailingBit(reaching) & 7u;
                     reaching &= reaching - 1u;
                     let at = subgroupShuffle(place, i);
-                    let shape = subgroupShuffle(conic, i);
+                    let shape = subgroupShuffle(half, i);
                     let power = power_at(shape, at.x - center_x, at.y - center_y);
                     let hit = blend.live & within_reach(shape, power) & PxB(some);
                     blend = blended(blend, hit, power, at.wz, subgroupShuffle(color, i).rgb, subgroupShuffle(entry, i) - tile.begin);

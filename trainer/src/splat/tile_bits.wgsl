@@ -1,14 +1,14 @@
 // tile_bits: from one mask of tiles an entry to one bit an entry for each of the 16 tiles.
 //
 // threads   256 per 512 entries
-// reads     status, entry_tiles [n_entries]
+// reads     status, entries [n_entries]
 // writes    tile_bits [16, n_words]: bit i of word w tells of entry 32 w + i
 
 #import view
 #import status
 
 @group(0) @binding(0) var<storage, read> status: array<u32>;
-@group(0) @binding(1) var<storage, read> entry_tiles: array<u32>;
+@group(0) @binding(1) var<storage, read> entries: array<vec4u>;
 @group(0) @binding(2) var<storage, read_write> tile_bits: array<u32>;
 
 var<workgroup> wg_masks: array<u32, 528>; // 16 rows of 32 and one, so that the rows begin in different banks
@@ -19,7 +19,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let first = folded(wg, n_wgs) * 512u;
     for (var i = lane; i < 512u; i += 256u) {
         var mask = 0u;
-        if first + i < n { mask = entry_tiles[first + i]; }
+        if first + i < n { mask = entries[first + i].y; }
         wg_masks[i / 32u * 33u + i % 32u] = mask;
     }
     workgroupBarrier(); // The masks are there.

@@ -2,7 +2,7 @@
 #![expect(clippy::cast_possible_truncation, reason = "counts derived from caps that are u32, and bits of a seed")]
 
 use super::arrays::SplatArrays;
-use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_sh_rest, n_bins, n_tiles};
+use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_bins, n_sh_rest, n_tiles};
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::options::SplatOptions;
 use super::params::{Camera, Growth, LOW_PASS_PX2, Rule, Supervision, status};
