@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use trainer::eval::{Lpips, PixelPair, depth_rmse_m, psnr, ssim};
 use trainer::request::Shutter;
+use trainer::splat::PosedLens;
 use trainer::{Keyframe, Method, Picture, Projection, RenderRequest};
 
 /// Names the weights of LPIPS where no flag does.
@@ -159,14 +160,15 @@ fn mean(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
 
 /// The picture a model shows where a keyframe was taken, sheared as the keyframe is.
 pub(crate) fn draw(method: &mut dyn Method, keyframe: &Keyframe) -> Result<Picture, trainer::Error> {
-    method.render(&request(keyframe))
+    let lens = method.posed_lens(keyframe)?;
+    method.render(&request(keyframe, &lens))
 }
 
-fn request(keyframe: &Keyframe) -> RenderRequest {
+fn request(keyframe: &Keyframe, lens: &PosedLens) -> RenderRequest {
     RenderRequest {
-        world_from_camera: keyframe.world_from_camera,
+        world_from_camera: lens.world_from_camera,
         size_px: keyframe.size_px,
-        projection: Projection::Pinhole { focal_px: keyframe.focal_px, principal_px: keyframe.principal_px },
+        projection: Projection::Pinhole { focal_px: lens.focal_px, principal_px: lens.principal_px },
         shutter: keyframe.twist.map(|twist| Shutter { twist, readout_secs: keyframe.readout_secs }),
         near_m: NEAR_M,
         far_m: FAR_M,
@@ -183,7 +185,7 @@ fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<O
         size_px: depth.size_px,
         projection: Projection::Pinhole { focal_px: depth.focal_px, principal_px: depth.principal_px },
         shutter: None,
-        ..request(keyframe)
+        ..request(keyframe, &PosedLens::of(keyframe))
     })?;
     Ok(depth_rmse_m(&drawn.depth_m, &depth.depth_m)?)
 }
@@ -191,7 +193,8 @@ fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<O
 /// The noise-free image has no shear, and is seen from the true pose.
 fn truth_score(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<Option<f64>> {
     let Some(truth) = &keyframe.truth else { return Ok(None) };
-    let at_truth = RenderRequest { world_from_camera: truth.world_from_camera, shutter: None, ..request(keyframe) };
+    let lens = PosedLens { world_from_camera: truth.world_from_camera, ..method.posed_lens(keyframe)? };
+    let at_truth = RenderRequest { shutter: None, ..request(keyframe, &lens) };
     let drawn = method.render(&at_truth)?;
     Ok(Some(psnr(&PixelPair::new(keyframe.size_px, &drawn.rgba_srgb, &truth.rgba_srgb)?)?))
 }

@@ -13,7 +13,7 @@ use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use trainer::Split;
-use trainer::splat::SplatOptions;
+use trainer::splat::{SplatOptions, TermSet};
 
 /// Flags of `train`.
 #[derive(Debug, clap::Args)]
@@ -28,6 +28,10 @@ pub(crate) struct Args {
     /// Stop after N optimiser steps; no decision reads the clock then
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
+    /// What is learned about cameras along with the scene, separated by commas: mount, delay, lens, image-poses,
+    /// image-gains [default: nothing]
+    #[arg(long, value_name = "TERMS", value_delimiter = ',', hide_possible_values = true)]
+    refine: Vec<Refine>,
     #[command(flatten)]
     images: DataArgs,
     /// Weights of LPIPS for `SqueezeNet` (safetensors) [default: what `FIELDRIG_LPIPS_WEIGHTS` names; none: no LPIPS]
@@ -102,7 +106,28 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     Ok(exit::after(&data.losses))
 }
 
+/// A group of terms of `--refine`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Refine {
+    Mount,
+    Delay,
+    Lens,
+    ImagePoses,
+    ImageGains,
+}
+
 impl Args {
+    fn terms(&self) -> TermSet {
+        let has = |term| self.refine.contains(&term);
+        TermSet {
+            mount: has(Refine::Mount),
+            delay: has(Refine::Delay),
+            lens: has(Refine::Lens),
+            image_poses: has(Refine::ImagePoses),
+            image_gains: has(Refine::ImageGains),
+        }
+    }
+
     fn limits(&self) -> Result<Limits, BadArgument> {
         const USUAL_SECONDS: f64 = 120.0;
         if self.seconds.is_some_and(|seconds| seconds.is_nan() || seconds < 0.0) {
@@ -115,13 +140,15 @@ impl Args {
     /// The scene model: the recording's rig file says which, with the flags over it; a folder has the flags only.
     fn model(&self, data: &Data) -> Result<(Kind, SplatOptions), BadArgument> {
         if let Some(rig) = &data.rig {
-            return Ok((Kind::of_rig(rig)?, options(&rig.train, self.steps)?));
+            let options = SplatOptions { camera_terms: self.terms(), ..options(&rig.train, self.steps)? };
+            return Ok((Kind::of_rig(rig)?, options));
         }
         let usual = SplatOptions::default();
         let options = SplatOptions {
             seed: self.training.seed.unwrap_or(USUAL_SEED),
             max_splats: self.training.max_splats.map_or(usual.max_splats, |n| n.try_into().unwrap_or(u32::MAX)),
             max_bytes: self.training.max_bytes,
+            camera_terms: self.terms(),
             n_planned_steps: self.steps.unwrap_or(usual.n_planned_steps),
             ..usual
         };

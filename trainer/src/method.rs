@@ -1,5 +1,6 @@
 //! What every scene model can do.
 
+use crate::splat::PosedLens;
 use crate::{Error, Keyframe, Picture, RenderRequest};
 use kinematics::Stamp;
 use std::path::Path;
@@ -35,6 +36,8 @@ pub trait Method {
     fn prepare(&mut self) -> Result<(), Error>;
     /// Draws a picture; works from the first keyframe on.
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error>;
+    /// The camera of a keyframe as the model has it: with what was learned about all its images, not about this one.
+    fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error>;
     /// Where training stands.
     fn progress(&self) -> Progress;
     /// Writes the model into a folder.

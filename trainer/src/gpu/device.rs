@@ -139,6 +139,12 @@ impl Gpu {
         buffer
     }
 
+    /// A buffer that one kernel writes and others read as a uniform.
+    pub fn uniform_and_storage(&self, label: &str, bytes: u64) -> Buffer {
+        let usage = wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST;
+        self.buffer(label, bytes, usage)
+    }
+
     /// Writes before the next submit; a length that is no multiple of 4 is filled up with zeros.
     pub fn write(&self, buffer: &Buffer, offset_bytes: u64, contents: &[u8]) {
         let whole = contents.len() / 4 * 4;

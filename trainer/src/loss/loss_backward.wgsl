@@ -1,8 +1,9 @@
 // loss_backward: the slope of the loss towards every pixel's color, transmittance and depth.
 //
 // threads   one per pixel, a workgroup per 16 x 16 pixels
-// reads     view, supervision, status, image, depth [n_pixels] (premultiplied), target_image, target_depth [n_pixels] (metres, 0: none), slopes
-// writes    upstream [n_pixels] (v of rgb; w: v of depth), rest [n_pixels] (see backward.wgsl; y: absolute error), errors [n_tiles]
+// reads     view, supervision, gains (of the picture before it is compared), status, image, depth [n_pixels] (premultiplied), target_image, target_depth [n_pixels] (metres, 0: none), slopes
+// writes    upstream [n_pixels] (v of rgb; w: v of depth), rest [n_pixels] (see backward.wgsl; y: absolute error), gain_sums [n_tiles] (slope
+//           towards the logarithm of the gains; w: sum of the absolute errors)
 // twin      loss/reference.rs
 
 #import view
@@ -19,13 +20,14 @@
 @group(0) @binding(7) var<storage, read> slopes: array<f32>;
 @group(0) @binding(8) var<storage, read_write> upstream: array<vec4f>;
 @group(0) @binding(9) var<storage, read_write> rest: array<vec2f>;
-@group(0) @binding(10) var<storage, read_write> errors: array<f32>;
+@group(0) @binding(10) var<storage, read_write> gain_sums: array<vec4f>;
+@group(0) @binding(11) var<storage, read> gains: vec4f;
 
 override SSIM: bool = true;
 override DEPTH: bool = true;
 var<workgroup> wg_slopes: array<vec4f, 676>;
 var<workgroup> wg_rows: array<vec4f, 416>;
-var<workgroup> wg_errors: array<f32, 256>;
+var<workgroup> wg_gains: array<vec4f, 256>;
 
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
@@ -41,7 +43,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let color = image[at];
     let seen = on_image && packed >= 0x01000000u;
     let background = background_at(supervision, status[STEP]);
-    let picture = color.rgb + color.w * background;
+    let picture = gains.rgb * (color.rgb + color.w * background);
     let wanted = rgb_of(packed);
     let per_value = 1.0 / (3.0 * f32(n_pixels));
     var v_color = (1.0 - supervision.dssim_frac) * per_value * sign(picture - wanted);
@@ -73,6 +75,8 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     }
     var error = 0.0;
     if seen { error = dot(abs(picture - wanted), vec3f(1.0 / 3.0)); } else { v_color = vec3f(0.0); }
+    let v_log_gain = v_color * picture;
+    v_color *= gains.rgb;
     var v_transmittance = dot(v_color, background);
     var v_depth = 0.0;
     let depth_sum = depth[at];
@@ -88,17 +92,17 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         upstream[at] = vec4f(v_color, v_depth);
         rest[at] = vec2f(dot(color.rgb, v_color) + depth_sum * v_depth + color.w * v_transmittance, error);
     }
-    wg_errors[lane] = error;
-    workgroupBarrier(); // All errors are there.
+    wg_gains[lane] = vec4f(v_log_gain, error);
+    workgroupBarrier(); // All are there.
     if lane < 16u {
-        var sum = 0.0;
-        for (var i = 0u; i < 16u; i++) { sum += wg_errors[lane * 16u + i]; }
-        wg_errors[lane * 16u] = sum; // Each lane writes only the first of those it has read.
+        var sum = vec4f(0.0);
+        for (var i = 0u; i < 16u; i++) { sum += wg_gains[lane * 16u + i]; }
+        wg_gains[lane * 16u] = sum; // Each lane writes only the first of those it has read.
     }
     workgroupBarrier(); // The 16 partial sums are there.
     if lane == 0u && in_grid {
-        var sum = 0.0;
-        for (var i = 0u; i < 16u; i++) { sum += wg_errors[i * 16u]; }
-        errors[tile] = sum;
+        var sum = vec4f(0.0);
+        for (var i = 0u; i < 16u; i++) { sum += wg_gains[i * 16u]; }
+        gain_sums[tile] = sum;
     }
 }

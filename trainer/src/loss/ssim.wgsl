@@ -1,7 +1,7 @@
 // ssim: the structural similarity of picture and keyframe, and its slopes towards the window's statistics.
 //
 // threads   one per pixel, a workgroup per 16 x 16 pixels
-// reads     view, supervision, status, image [n_pixels] (premultiplied rgb, transmittance), target [n_pixels] (rgba8; a = 0: masked)
+// reads     view, supervision, gains, status, image [n_pixels] (premultiplied rgb, transmittance), target [n_pixels] (rgba8; a = 0: masked)
 // writes    slopes [3 channels, 3, n_pixels]: of E[x], E[x x], E[x y]
 // twin      loss/reference.rs
 // source    Wang et al. 2004; gaussian 11, sigma 1.5, zeros outside; one pass over shared memory as in Mallick et al. 2024
@@ -16,6 +16,7 @@
 @group(0) @binding(3) var<storage, read> image: array<vec4f>;
 @group(0) @binding(4) var<storage, read> target_image: array<u32>;
 @group(0) @binding(5) var<storage, read_write> slopes: array<f32>;
+@group(0) @binding(6) var<storage, read> gains: vec4f;
 
 var<workgroup> wg_pair: array<vec2f, 676>;        // picture, keyframe
 var<workgroup> wg_means: array<vec4f, 416>;       // along rows: x, y, x x, y y
@@ -38,7 +39,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
                 let packed = target_image[at];
                 let color = image[at];
                 if packed >= 0x01000000u {
-                    pair = vec2f(color[channel] + color.w * background[channel], rgb_of(packed)[channel]);
+                    pair = vec2f(gains[channel] * (color[channel] + color.w * background[channel]), rgb_of(packed)[channel]);
                 }
             }
             wg_pair[i] = pair;

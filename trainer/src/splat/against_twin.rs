@@ -2,16 +2,17 @@
 #![expect(clippy::needless_range_loop, reason = "channels and axes index several arrays at once")]
 
 use super::arrays::SplatArrays;
+use super::camera_terms::{CameraTerms, TermSet};
 use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
 use super::reference::{self, RenderedImage, Splat, Upstream, View, scene};
-use crate::Shutter;
+use crate::{Keyframe, Shutter, Split};
 use crate::gpu::{Buffer, Gpu, GpuOptions, Passes, f32_of};
 use crate::loss::reference as loss_reference;
 use crate::mismatches::Mismatches;
-use kinematics::Twist;
+use kinematics::{Stamp, Transform, Twist};
 use nalgebra::Vector3;
 use std::sync::Arc;
 
@@ -198,6 +199,7 @@ pub(super) struct Wanted {
     image: Buffer,
     depth: Buffer,
     supervision: Buffer,
+    gains: Buffer,
 }
 
 impl Wanted {
@@ -221,11 +223,12 @@ impl Wanted {
             depth_clip_m: f32_of(weights.depth_clip_m),
             varied_background: 0.0,
         };
-        Self { image, depth, supervision: gpu.uniform_with("supervision", &supervision) }
+        let gains = gpu.storage_with("gains", bytemuck::cast_slice(&[1.0f32; 4])).unwrap();
+        Self { image, depth, supervision: gpu.uniform_with("supervision", &supervision), gains }
     }
 
     pub(super) fn target(&self) -> Target<'_> {
-        Target { image: &self.image, depth: &self.depth, supervision: &self.supervision, ssim: true }
+        Target { image: &self.image, depth: &self.depth, supervision: &self.supervision, gains: &self.gains, ssim: true }
     }
 }
 
@@ -248,8 +251,14 @@ fn check_gradients(
     view_passes.draw(&mut passes, &bench.draw);
     view_passes.compare(&mut passes, &bench.learn, &wanted.target());
     view_passes.backward(&mut passes, &bench.learn);
-    view_passes.update(&mut passes, &gradients_only, &rule);
+    view_passes.update(&mut passes, &gradients_only, &rule, true);
+    let all = TermSet { mount: true, delay: true, lens: true, image_poses: true, image_gains: true };
+    let mut cameras = CameraTerms::new(gpu, all).unwrap();
+    let lens = cameras.lens(gpu, &moving_keyframe()).unwrap();
+    let refine = LearnPipelines::camera_gradients_only(gpu).unwrap();
+    cameras.refine_with(&view_passes, &mut passes, &refine, &lens);
     passes.submit(gpu);
+    check_camera_gradients(&cameras.slopes(gpu), view, splats, &expected.view, upstream, weights.background_rgb);
     let n = target.rgb.len();
     let slopes: Vec<[f32; 4]> = gpu.read(&bench.frame.upstream, n).unwrap();
     let mut wrong = Mismatches::default();
@@ -318,6 +327,78 @@ fn check_gradients(
     wrong.assert_none();
 }
 
+fn moving_keyframe() -> Keyframe {
+    Keyframe {
+        camera: "test".into(),
+        stamp: Stamp(0),
+        size_px: [1, 1],
+        focal_px: [1.0; 2],
+        principal_px: [0.5; 2],
+        rgba_srgb: [0; 4].into(),
+        depth: None,
+        world_from_camera: Transform::identity(),
+        twist: Some(Twist {
+            linear_m_s: Vector3::new(0.25, -0.5, 0.125),
+            angular_rad_s: Vector3::new(-0.5, 0.75, 1.0),
+        }),
+        readout_secs: 0.0,
+        split: Split::Train,
+        truth: None,
+    }
+}
+
+/// The pose against the twin's gradient; the lens by central differences of the twin's picture.
+fn check_camera_gradients(
+    got: &[f64],
+    view: &View,
+    splats: &[Splat],
+    by_view: &reference::ViewGrad,
+    upstream: &Upstream,
+    background_rgb: [f64; 3],
+) {
+    const STEP: f64 = 1e-5;
+    let decisions = reference::decide(view, splats);
+    let along = |change: &dyn Fn(&mut View, f64)| {
+        let image = |step: f64| {
+            let mut changed = view.clone();
+            change(&mut changed, step);
+            reference::render_decided(&changed, splats, &decisions)
+        };
+        let (high, low) = (image(STEP), image(-STEP));
+        let dot = |high: &RenderedImage, sign: f64| {
+            let rgb = high.rgb.as_flattened().iter().zip(upstream.rgb.as_flattened()).map(|(x, v)| x * v).sum::<f64>();
+            let of = |x: &[f64], v: &[f64]| x.iter().zip(v).map(|(x, v)| x * v).sum::<f64>();
+            sign * (rgb + of(&high.depth, &upstream.depth) + of(&high.transmittance, &upstream.transmittance))
+        };
+        (dot(&high, 1.0) + dot(&low, -1.0)) / (2.0 * STEP)
+    };
+    let [x, y, z, turn_x, turn_y, turn_z] = by_view.pose;
+    let twist = moving_keyframe().twist.unwrap();
+    let shift = Vector3::new(x, y, z);
+    let turn = Vector3::new(turn_x, turn_y, turn_z);
+    let mut expected = vec![turn_x, turn_y, turn_z, x, y, z];
+    expected.push(-twist.angular_rad_s.dot(&turn) - twist.linear_m_s.dot(&shift));
+    for axis in 0..2 {
+        expected.push(along(&|view, step| view.focal_px[axis] *= step.exp()));
+    }
+    for axis in 0..2 {
+        expected.push(along(&|view, step| view.principal_px[axis] += step * view.focal_px[axis]));
+    }
+    let image = reference::render_decided(view, splats, &decisions);
+    for channel in 0..3 {
+        let picture = |pixel: usize| image.rgb[pixel][channel] + image.transmittance[pixel] * background_rgb[channel];
+        expected.push((0..image.rgb.len()).map(|pixel| upstream.rgb[pixel][channel] * picture(pixel)).sum());
+    }
+    let mut wrong = Mismatches::default();
+    for group in [0..3, 3..6, 6..7, 7..9, 9..11, 11..14] {
+        let largest = expected[group.clone()].iter().fold(1e-12f64, |most, value| most.max(value.abs()));
+        for term in group {
+            wrong.check(format!("camera {term}"), got[term], expected[term], GRADIENT_REL * largest, GRADIENT_REL);
+        }
+    }
+    wrong.assert_none();
+}
+
 /// A pile of opaque splats saturates its tile long before the list ends; what lies behind learns nothing from it, and in
 /// particular not what an earlier step left in its slots.
 #[test]
@@ -347,7 +428,7 @@ fn hidden_splats_have_no_gradient() {
         let view_passes = bench.passes();
         view_passes.draw(&mut passes, &bench.draw);
         view_passes.backward(&mut passes, &bench.learn);
-        view_passes.update(&mut passes, &gradients_only, &rule);
+        view_passes.update(&mut passes, &gradients_only, &rule, true);
         passes.submit(gpu);
         let got = bench.splats.read(gpu).unwrap();
         let learns = |ix: usize| got.sh[16 * ix].iter().any(|value| *value != 0.0);

@@ -63,6 +63,7 @@ struct KernelBench {
     image: Buffer,
     depth: Buffer,
     supervision: Buffer,
+    gains: Buffer,
     rule: Buffer,
     size_px: [u32; 2],
 }
@@ -131,6 +132,7 @@ impl KernelBench {
             image: gpu.storage_with("bench.target", bytemuck::cast_slice(&noise))?,
             depth: gpu.storage("bench.depth", 4 * u64::from(n_pixels))?,
             supervision: gpu.uniform_with("bench.supervision", &<Supervision as bytemuck::Zeroable>::zeroed()),
+            gains: gpu.storage_with("bench.gains", bytemuck::cast_slice(&[1.0f32; 4]))?,
             rule: gpu.uniform_with("bench.rule", &rule()),
             draw,
             learn,
@@ -185,10 +187,10 @@ impl KernelBench {
         view.compare(
             passes,
             &self.learn,
-            &Target { image: &self.image, depth: &self.depth, supervision: &self.supervision, ssim: false },
+            &Target { image: &self.image, depth: &self.depth, supervision: &self.supervision, gains: &self.gains, ssim: false },
         );
         view.backward(passes, &self.learn);
-        view.update(passes, &self.learn.update, &self.rule);
+        view.update(passes, &self.learn.update, &self.rule, false);
         passes.dispatch(&self.gpu, &self.learn.advance, 1, &[("status", &self.status)]);
     }
 

@@ -207,6 +207,7 @@ pub(crate) struct Scratch {
     pub(crate) entries: Buffer,
     pub(crate) tile_bits: Buffer,
     pub(crate) gradients: Buffer,
+    pub(crate) camera_sums: Buffer,
 }
 
 /// Room a [`Scratch`] has.
@@ -243,6 +244,7 @@ impl Scratch {
             entries: gpu.storage("splat.entries", 16 * u64::from(n_entries.max(1)))?,
             tile_bits: gpu.storage("splat.tile_bits", 64 * u64::from(n_entries.div_ceil(32).max(1)))?,
             gradients: gpu.storage("splat.gradients", 48 * u64::from(n_slots))?,
+            camera_sums: gpu.storage("splat.camera_sums", if n_slots > 0 { 48 * u64::from(n_blocks) } else { 0 })?,
         })
     }
 }
@@ -260,7 +262,7 @@ pub(crate) struct Frame {
     pub(crate) slopes: Buffer,
     pub(crate) upstream: Buffer,
     pub(crate) rest: Buffer,
-    pub(crate) errors: Buffer,
+    pub(crate) gain_sums: Buffer,
 }
 
 impl Frame {
@@ -280,7 +282,7 @@ impl Frame {
             slopes: slope("splat.slopes", 36)?,
             upstream: slope("splat.upstream", 16)?,
             rest: slope("splat.rest", 8)?,
-            errors: tiles("splat.errors", 4)?,
+            gain_sums: tiles("splat.gain_sums", 16)?,
         })
     }
 }

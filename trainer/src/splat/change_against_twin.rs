@@ -111,7 +111,7 @@ fn optimiser_steps_match_the_twin() {
         view_passes.draw(&mut passes, &bench.draw);
         view_passes.compare(&mut passes, &bench.learn, &wanted.target());
         view_passes.backward(&mut passes, &bench.learn);
-        view_passes.update(&mut passes, &bench.learn.update, &rule);
+        view_passes.update(&mut passes, &bench.learn.update, &rule, false);
         passes.submit(gpu);
         gpu.write(&bench.status, 4 * status::STEP as u64, bytemuck::bytes_of(&(step + 1)));
     }

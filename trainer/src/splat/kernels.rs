@@ -36,7 +36,21 @@ const SHARED: &[Source] = &[
     BINS,
     TILES,
     source!("block_bins"),
+    source!("camera_terms"),
+    source!("camera_sums", "camera_sums_none"),
 ];
+/// What `update` imports where cameras are learned, too.
+const WITH_CAMERA: &[Source] = &[
+    VIEW,
+    STATUS,
+    MODEL,
+    PROJECTION,
+    source!("sh"),
+    GRADIENT,
+    source!("random"),
+    source!("camera_sums", "camera_sums_tree"),
+];
+
 /// What the kernels over pixels import.
 macro_rules! blend_sources {
     ($($source:expr),*) => {
@@ -114,6 +128,9 @@ pub const KERNELS: &[Kernel] = &[
     kernel!("backward", BLEND_BY_MEMORY),
     kernel!("backward_strips", BLEND_STRIPS),
     kernel!("update"),
+    kernel!("update", WITH_CAMERA),
+    kernel!("correct_view"),
+    kernel!("refine_camera"),
     kernel!("advance"),
     kernel!("grow_weigh"),
     kernel!("grow_scan"),
@@ -161,6 +178,9 @@ pub(crate) struct LearnPipelines {
     pub(crate) loss_without_ssim: Pipeline,
     pub(crate) backward: Pipeline,
     pub(crate) update: Pipeline,
+    pub(crate) update_with_camera: Pipeline,
+    pub(crate) correct_view: Pipeline,
+    pub(crate) refine_camera: Pipeline,
     pub(crate) advance: Pipeline,
     pub(crate) grow_weigh: Pipeline,
     pub(crate) grow_scan: Pipeline,
@@ -178,6 +198,9 @@ impl LearnPipelines {
             loss_without_ssim: Pipeline::new(gpu, kernel!("loss", "loss_backward", SHARED), &[("SSIM", 0.0)])?,
             backward: Pipeline::new(gpu, blend.backward, &lanes)?,
             update: Pipeline::new(gpu, kernel!("update"), &[])?,
+            update_with_camera: Pipeline::new(gpu, kernel!("update", WITH_CAMERA), &[])?,
+            correct_view: Pipeline::new(gpu, kernel!("correct_view"), &[])?,
+            refine_camera: Pipeline::new(gpu, kernel!("refine_camera"), &[])?,
             advance: Pipeline::new(gpu, kernel!("advance"), &[])?,
             grow_weigh: Pipeline::new(gpu, kernel!("grow_weigh"), &[])?,
             grow_scan: Pipeline::new(gpu, kernel!("grow_scan"), &[])?,
@@ -189,7 +212,13 @@ impl LearnPipelines {
     /// The update kernel that hands out gradients in place of new values, for comparison with the twin.
     #[cfg(test)]
     pub(crate) fn gradients_only(gpu: &Gpu) -> Result<Pipeline, Error> {
-        Pipeline::new(gpu, kernel!("update"), &[("GRADIENTS_ONLY", 1.0)])
+        Pipeline::new(gpu, kernel!("update", WITH_CAMERA), &[("GRADIENTS_ONLY", 1.0)])
+    }
+
+    /// Likewise for the terms of cameras.
+    #[cfg(test)]
+    pub(crate) fn camera_gradients_only(gpu: &Gpu) -> Result<Pipeline, Error> {
+        Pipeline::new(gpu, kernel!("refine_camera"), &[("GRADIENTS_ONLY", 1.0)])
     }
 }
 
@@ -223,7 +252,7 @@ mod tests {
 
     #[test]
     fn structs_have_the_same_fields_in_rust_and_wgsl() {
-        use crate::splat::params::{Capacity, Growth, Model, Rule, Supervision, View};
+        use crate::splat::params::{CameraRule, Capacity, Growth, Lens, Model, Rule, Supervision, View};
         assert_layout!(
             View,
             [
@@ -270,6 +299,11 @@ mod tests {
         );
         assert_layout!(Supervision, [background_srgb, dssim_frac, depth_weight, depth_clip_m, varied_background]);
         assert_layout!(Growth, [n_before, n_after, key, capacity, n_sh_rest, child_spread, least_opacity, unused]);
+        assert_layout!(Lens, [linear, angular, camera_terms, image_terms, unused]);
+        assert_layout!(
+            CameraRule,
+            [of_camera, of_image, turn_rate, shift_rate_m, delay_rate, focal_rate, gain_rate, image_pull]
+        );
         assert_layout!(Capacity, [n_entries, n_slots, unused]);
     }
 

@@ -5,6 +5,7 @@ mod against_twin;
 pub mod arrays;
 pub mod bench;
 mod buffers;
+mod camera_terms;
 #[cfg(test)]
 mod change_against_twin;
 pub mod cloud;
@@ -20,5 +21,6 @@ mod seed;
 mod trainer;
 mod views;
 
+pub use camera_terms::{CameraFix, PosedLens, TermSet};
 pub use options::SplatOptions;
 pub use trainer::SplatTrainer;

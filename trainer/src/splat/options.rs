@@ -1,5 +1,7 @@
 //! How a splat model learns.
 
+use super::camera_terms::TermSet;
+
 /// Settings of a [`super::SplatTrainer`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct SplatOptions {
@@ -20,6 +22,8 @@ pub struct SplatOptions {
     /// Steps at a quarter of the resolution, and past which step the full one is used; `None`: few on a GPU, many on a
     /// processor, where a step takes as long as the image has pixels.
     pub coarse_steps: Option<[u64; 2]>,
+    /// What is learned about cameras.
+    pub camera_terms: TermSet,
     /// Splats that one depth image may add; `None`: fewer on a processor.
     pub seeds_per_image: Option<f64>,
 }
@@ -35,16 +39,17 @@ impl Default for SplatOptions {
             dssim_frac: 0.2,
             depth_per_m: 0.1,
             coarse_steps: None,
+            camera_terms: TermSet::default(),
             seeds_per_image: None,
         }
     }
 }
 
 impl SplatOptions {
-    /// Bytes of one splat: parameters and Adam's two moments.
+    /// Bytes of one splat: parameters, Adam's moments (one for all colors past the constant) and the sum of errors.
     pub fn bytes_per_splat(&self) -> u64 {
-        let n_floats = 12 + 3 + u64::from(super::buffers::n_sh_rest(self.sh_degree)); // Means, rotations and shapes are padded to 4 each.
-        4 * (3 * n_floats + 1)
+        let n_floats = 12 + 3; // Means, rotations and shapes are padded to 4 each.
+        4 * (3 * n_floats + u64::from(super::buffers::n_sh_rest(self.sh_degree)) + 1 + 1)
     }
 
     /// Most splats that both caps allow.

@@ -140,6 +140,34 @@ pub(crate) struct Rule {
     pub(crate) unused: u32,
 }
 
+/// Terms of a camera or of an image, as in shared/camera_terms.wgsl.
+pub(crate) const N_TERMS: u32 = 16;
+
+/// `Lens` of shared/camera_terms.wgsl.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct Lens {
+    pub(crate) linear: [f32; 4],
+    pub(crate) angular: [f32; 4],
+    pub(crate) camera_terms: u32,
+    pub(crate) image_terms: u32,
+    pub(crate) unused: [u32; 2],
+}
+
+/// `CameraRule` of shared/camera_terms.wgsl.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct CameraRule {
+    pub(crate) of_camera: u32,
+    pub(crate) of_image: u32,
+    pub(crate) turn_rate: f32,
+    pub(crate) shift_rate_m: f32,
+    pub(crate) delay_rate: f32,
+    pub(crate) focal_rate: f32,
+    pub(crate) gain_rate: f32,
+    pub(crate) image_pull: f32,
+}
+
 /// `Supervision` of shared/supervision.wgsl: what a picture is compared with and how.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]

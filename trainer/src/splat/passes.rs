@@ -23,6 +23,8 @@ pub(crate) struct Target<'a> {
     pub(crate) image: &'a Buffer,
     pub(crate) depth: &'a Buffer,
     pub(crate) supervision: &'a Buffer,
+    /// Of the picture's red, green and blue before it is compared.
+    pub(crate) gains: &'a Buffer,
     /// Whether D-SSIM is part of the loss.
     pub(crate) ssim: bool,
 }
@@ -204,6 +206,7 @@ impl ViewPasses<'_> {
             ("status", status),
             ("image", &frame.image),
             ("target_image", target.image),
+            ("gains", target.gains),
         ];
         if target.ssim {
             let mut buffers = base.to_vec();
@@ -217,7 +220,7 @@ impl ViewPasses<'_> {
             ("slopes", &frame.slopes),
             ("upstream", &frame.upstream),
             ("rest", &frame.rest),
-            ("errors", &frame.errors),
+            ("gain_sums", &frame.gain_sums),
         ]);
         passes.dispatch(
             gpu,
@@ -249,32 +252,32 @@ impl ViewPasses<'_> {
         );
     }
 
-    /// Carries the slopes from the intersections to the parameters and takes the optimiser's step.
-    pub(crate) fn update(&self, passes: &mut Passes, update: &Pipeline, rule: &Buffer) {
+    /// Carries the slopes from the intersections to the parameters and takes the optimiser's step; with `camera`, the
+    /// kernel that also sums the slopes towards the camera.
+    pub(crate) fn update(&self, passes: &mut Passes, update: &Pipeline, rule: &Buffer, camera: bool) {
         let Self { gpu, splats, scratch, status, view, .. } = *self;
-        passes.dispatch(
-            gpu,
-            update,
-            u64::from(splats.n_splats.div_ceil(256)),
-            &[
-                ("view", view),
-                ("model", &splats.model),
-                ("rule", rule),
-                ("tile_counts", &scratch.tile_counts),
-                ("slot_begins", &scratch.slot_begins),
-                ("gradients", &scratch.gradients),
-                ("means", &splats.means),
-                ("rotations", &splats.rotations),
-                ("shapes", &splats.shapes),
-                ("sh_dc", &splats.sh_dc),
-                ("sh_rest", &splats.sh_rest),
-                ("moments", &splats.moments),
-                ("sh_dc_moments", &splats.sh_dc_moments),
-                ("sh_rest_moments", &splats.sh_rest_moments),
-                ("status", status),
-                ("error_sums", &splats.error_sums),
-                ("drawn", &scratch.drawn),
-            ],
-        );
+        let mut buffers = vec![
+            ("view", view),
+            ("model", &splats.model),
+            ("rule", rule),
+            ("tile_counts", &scratch.tile_counts),
+            ("slot_begins", &scratch.slot_begins),
+            ("gradients", &scratch.gradients),
+            ("means", &splats.means),
+            ("rotations", &splats.rotations),
+            ("shapes", &splats.shapes),
+            ("sh_dc", &splats.sh_dc),
+            ("sh_rest", &splats.sh_rest),
+            ("moments", &splats.moments),
+            ("sh_dc_moments", &splats.sh_dc_moments),
+            ("sh_rest_moments", &splats.sh_rest_moments),
+            ("status", status),
+            ("error_sums", &splats.error_sums),
+            ("drawn", &scratch.drawn),
+        ];
+        if camera {
+            buffers.push(("camera_sums", &scratch.camera_sums));
+        }
+        passes.dispatch(gpu, update, u64::from(splats.n_splats.div_ceil(BLOCK)), &buffers);
     }
 }

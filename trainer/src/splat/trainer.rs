@@ -2,6 +2,7 @@
 #![expect(clippy::cast_possible_truncation, reason = "counts derived from caps that are u32, and bits of a seed")]
 
 use super::arrays::SplatArrays;
+use super::camera_terms::{CameraFix, CameraTerms, PosedLens};
 use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_bins, n_sh_rest, n_tiles};
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::options::SplatOptions;
@@ -12,6 +13,7 @@ use super::views::TrainView;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
 use crate::{Error, Keyframe, Method, Picture, Progress, Projection, RenderRequest, Split, ply};
 use kinematics::Stamp;
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -61,6 +63,7 @@ pub struct SplatTrainer {
     rule: Buffer,
     supervision: Buffer,
     plain: Buffer,
+    cameras: CameraTerms,
     passes: Passes,
     seeder: Seeder,
     /// Keyframes without depth since the last step.
@@ -149,6 +152,7 @@ impl SplatTrainer {
                 },
             ),
             plain: gpu.uniform_with("splat.background", &<Supervision as bytemuck::Zeroable>::zeroed()),
+            cameras: CameraTerms::new(&gpu, options.camera_terms)?,
             passes: Passes::default(),
             seeder: Seeder::default(),
             unseeded: Vec::new(),
@@ -190,6 +194,12 @@ impl SplatTrainer {
     pub fn arrays(&mut self) -> Result<SplatArrays, Error> {
         self.settle()?;
         self.splats.read(&self.gpu)
+    }
+
+    /// What was learned about each camera; empty where nothing is.
+    pub fn camera_fixes(&mut self) -> Result<BTreeMap<Arc<str>, CameraFix>, Error> {
+        self.settle()?;
+        self.cameras.fixes(&self.gpu)
     }
 
     /// Gradients that were not finite and were dropped.
@@ -272,6 +282,11 @@ impl SplatTrainer {
                 self.add(&discs)?;
             }
         }
+        if self.cameras.set.any() {
+            for view in &mut self.views {
+                view.give_lens(&self.gpu, &mut self.cameras)?;
+            }
+        }
         if self.splats.n_splats == 0 && !self.views.is_empty() {
             let keyframes: Vec<&Keyframe> = self.views.iter().map(|view| view.keyframe.as_ref()).collect();
             let cloud =
@@ -294,6 +309,10 @@ impl SplatTrainer {
     }
 
     fn write_rule(&self) {
+        if self.cameras.set.any() {
+            let done = self.step.saturating_sub(self.schedule_start) as f64 / self.options.n_planned_steps.max(1) as f64;
+            self.cameras.write_rule(&self.gpu, done, self.scene_size_m);
+        }
         let size = f32_of(self.scene_size_m);
         let cost = f32_of(
             (COST_IMAGES / self.views.len().max(1) as f64).clamp(COST_RANGE[0], COST_RANGE[1])
@@ -330,7 +349,7 @@ impl SplatTrainer {
         let need = self.scratch_need(size_px, true);
         self.ensure_scratch(need)?;
         ensure_frame(&self.gpu, &mut self.learn_frame, &mut self.passes, size_px, true)?;
-        let level = self.views[view_ix].level(&self.gpu, level_ix)?;
+        let (lens, level) = self.views[view_ix].lens_and_level(&self.gpu, level_ix)?;
         let (Some((_, scratch)), Some(frame)) = (&self.scratch, &self.learn_frame) else {
             return Err(Error::DeviceLost);
         };
@@ -340,19 +359,28 @@ impl SplatTrainer {
             scratch,
             frame,
             status: &self.learn_status,
-            view: &level.view,
+            view: if lens.is_some() { &self.cameras.corrected } else { &level.view },
             size_px,
         };
         let target = Target {
             image: &level.image,
             depth: &level.depth,
             supervision: &self.supervision,
+            gains: &self.cameras.gains,
             ssim: self.options.dssim_frac > 0.0,
         };
+        if let Some(lens) = lens {
+            self.cameras.correct(&self.gpu, &mut self.passes, learn, &level.view, lens);
+        }
         view.draw(&mut self.passes, &self.draw);
         view.compare(&mut self.passes, learn, &target);
         view.backward(&mut self.passes, learn);
-        view.update(&mut self.passes, &learn.update, &self.rule);
+        if let Some(lens) = lens {
+            view.update(&mut self.passes, &learn.update_with_camera, &self.rule, true);
+            self.cameras.refine(&view, &mut self.passes, learn, lens);
+        } else {
+            view.update(&mut self.passes, &learn.update, &self.rule, false);
+        }
         self.passes.dispatch(&self.gpu, &learn.advance, 1, &[("status", &self.learn_status)]);
         Ok(())
     }
@@ -583,6 +611,12 @@ impl Method for SplatTrainer {
                 super::equirect::render(request, |camera| self.draw_view(camera, request.background_srgb))
             }
         }
+    }
+
+    fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {
+        let lens = PosedLens::of(keyframe);
+        let fixes = self.camera_fixes()?;
+        Ok(fixes.get(&keyframe.camera).map_or(lens, |fix| fix.apply(&lens, keyframe.twist)))
     }
 
     fn progress(&self) -> Progress {

@@ -1,6 +1,6 @@
 // update: sum each splat's gradients over its intersections, carry them to its parameters, and take one Adam step.
 //
-// threads   one per splat
+// threads   256 per block of 256 splats
 // reads     view, model, rule, drawn, tile_counts, slot_begins, gradients, status
 // writes    means, rotations, shapes, sh_dc, sh_rest, their moments, error_sums; or, with GRADIENTS_ONLY, the gradients
 //           themselves in place of the values, for tests
@@ -59,7 +59,6 @@ struct Rule {
 @group(0) @binding(15) var<storage, read_write> error_sums: array<f32>;        // since the last change of the splat count
 @group(0) @binding(16) var<storage, read> drawn: array<Drawn>;
 
-override WG_SIZE = 256u;
 override GRADIENTS_ONLY: bool = false;
 const PI = 3.14159265358979;
 var<private> correction: vec2f;   // 1 / (1 - beta^t)
@@ -100,13 +99,29 @@ fn sh_term(sums: ptr<function, ShSums>, k: u32, basis: f32, slope: vec3f) {
     sh_rest[at + 2u * model.capacity] = moved.z;
 }
 
-@compute @workgroup_size(WG_SIZE)
+// The slope towards a small motion of the camera, of what one splat tells.
+struct CameraGradient {
+    turn: vec3f,
+    shift: vec3f,
+    focal: vec2f,
+    principal: vec2f,
+}
+
+#import camera_sums
+
+@compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
-    let splat_ix = folded(wg, n_wgs) * WG_SIZE + lane;
-    if splat_ix >= model.n_splats { return; } // Allowed here: no barrier, no subgroup operation below.
-    if atomicLoad(&status[FAILED]) != 0u { return; }
+    let block = folded(wg, n_wgs);
+    let splat_ix = block * 256u + lane;
+    var camera: CameraGradient;
+    if splat_ix < model.n_splats && atomicLoad(&status[FAILED]) == 0u { camera = learn(splat_ix); }
+    add_up_camera(lane, block, camera);
+}
+
+fn learn(splat_ix: u32) -> CameraGradient {
+    var camera: CameraGradient;
     let n_touched = tile_counts[splat_ix];
-    if n_touched == 0u && rule.update_all == 0u && !GRADIENTS_ONLY { return; }
+    if n_touched == 0u && rule.update_all == 0u && !GRADIENTS_ONLY { return camera; }
 
     var sum: Gradient;
     let begin = slot_begins[splat_ix];
@@ -170,13 +185,23 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
             + v_jacobian_x.z * f.x * ratio.x * (1.0 + p.unclamped.x) / (z * z)
             + v_jacobian_y.z * f.y * ratio.y * (1.0 + p.unclamped.y) / (z * z);
         let v_still = v_point + p.tau * cross(view.shutter_angular.xyz, v_point);
+        let still = camera_from_world(view, mean);
+        camera.shift = v_still;
+        camera.turn = cross(still, v_still);
+        let unturned = transpose(mat3x3f(view.camera_row_0.xyz, view.camera_row_1.xyz, view.camera_row_2.xyz)) * p.rotation;
+        let spin = p.tau * view.shutter_angular.xyz;
+        camera.turn += p.scale.x * cross(unturned[0], v_axis_0 + cross(spin, v_axis_0));
+        camera.turn += p.scale.y * cross(unturned[1], v_axis_1 + cross(spin, v_axis_1));
+        camera.turn += p.scale.z * cross(unturned[2], v_axis_2 + cross(spin, v_axis_2));
+        camera.principal = sum.place.xy;
+        camera.focal = sum.place.xy * p.point.xy / z + vec2f(dot(v_jacobian_x, p.jacobian_x), dot(v_jacobian_y, p.jacobian_y)) / f;
         v_mean = view.camera_row_0.xyz * v_still.x + view.camera_row_1.xyz * v_still.y + view.camera_row_2.xyz * v_still.z;
     }
 
     let v_color = select(vec3f(0.0), sum.color.rgb, drawn[splat_ix].color.rgb > vec3f(0.0)); // Drawn colors end at 0.
     if !GRADIENTS_ONLY && (!finite(vec4f(v_mean, v_opacity_logit)) || !finite(v_rotation) || !finite(vec4f(v_log_scale, sum.conic.w)) || !finite(vec4f(v_color, 0.0))) {
         atomicAdd(&status[N_POISONED], 1u);
-        return;
+        return CameraGradient();
     }
     let step = f32(atomicLoad(&status[STEP]));
     correction = 1.0 / (1.0 - pow(rule.betas, vec2f(step + 1.0)));
@@ -188,7 +213,9 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let direction = to_splat / distance;
     var sh = ShSums(splat_ix, v_color, pull, vec3f(0.0));
     each_sh(&sh, direction, model.sh_degree);
-    v_mean += (sh.v_direction - direction * dot(direction, sh.v_direction)) / distance;
+    let v_moved = (sh.v_direction - direction * dot(direction, sh.v_direction)) / distance;
+    v_mean += v_moved;
+    camera.shift += vec3f(dot(view.camera_row_0.xyz, v_moved), dot(view.camera_row_1.xyz, v_moved), dot(view.camera_row_2.xyz, v_moved));
 
     let capacity = model.capacity;
     if GRADIENTS_ONLY {
@@ -197,7 +224,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         shapes[splat_ix] = vec4f(v_log_scale, v_opacity_logit);
         for (var channel = 0u; channel < 3u; channel++) { sh_dc[channel * capacity + splat_ix] = SH_0 * v_color[channel]; }
         error_sums[splat_ix] = sum.conic.w;
-        return;
+        return camera;
     }
     sh_rest_moments[splat_ix] = mean_square;
     let done = clamp((step - rule.schedule_start) / max(rule.n_planned_steps, 1.0), 0.0, 1.0);
@@ -226,4 +253,5 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         sh_dc_moments[at] = moment;
     }
     error_sums[splat_ix] += sum.conic.w;
+    return camera;
 }

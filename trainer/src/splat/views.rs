@@ -4,6 +4,7 @@
     reason = "pixels are rounded down on purpose, within image sizes that are u32"
 )]
 
+use super::camera_terms::CameraTerms;
 use super::params::{Camera, LOW_PASS_PX2, TILE_PX};
 use crate::gpu::{Buffer, Gpu, f32_of};
 use crate::{Error, Keyframe, Shutter};
@@ -19,6 +20,8 @@ const FAR_M: f64 = 1e4;
 pub(crate) struct TrainView {
     pub(crate) keyframe: Arc<Keyframe>,
     levels: [Option<Level>; 3],
+    /// Where something is learned about cameras.
+    lens: Option<Buffer>,
 }
 
 /// One keyframe at one resolution.
@@ -34,17 +37,37 @@ pub(crate) struct Level {
 
 impl TrainView {
     pub(crate) fn new(keyframe: Arc<Keyframe>) -> Self {
-        Self { keyframe, levels: [const { None }; 3] }
+        Self { keyframe, levels: [const { None }; 3], lens: None }
+    }
+
+    /// Takes part in what is learned about cameras.
+    pub(crate) fn give_lens(&mut self, gpu: &Gpu, cameras: &mut CameraTerms) -> Result<(), Error> {
+        if self.lens.is_none() {
+            self.lens = Some(cameras.lens(gpu, &self.keyframe)?);
+        }
+        Ok(())
+    }
+
+    /// The lens, where it has one, and the level; see [`TrainView::level`].
+    pub(crate) fn lens_and_level(&mut self, gpu: &Gpu, level: u32) -> Result<(Option<&Buffer>, &Level), Error> {
+        self.level(gpu, level)?;
+        let level = self.clamped(level);
+        let made = self.levels[level].as_ref().ok_or(Error::DeviceLost)?;
+        Ok((self.lens.as_ref(), made))
+    }
+
+    fn clamped(&self, level: u32) -> usize {
+        let [width, height] = self.keyframe.size_px;
+        level.min((width.min(height) / TILE_PX).max(1).ilog2()) as usize
     }
 
     /// The keyframe `2^level` times smaller, but no side below a tile's, uploaded at first use.
     pub(crate) fn level(&mut self, gpu: &Gpu, level: u32) -> Result<&Level, Error> {
-        let [width, height] = self.keyframe.size_px;
-        let level = level.min((width.min(height) / TILE_PX).max(1).ilog2());
-        let slot = &mut self.levels[level as usize];
+        let level = self.clamped(level);
+        let slot = &mut self.levels[level];
         let made = match slot.take() {
             Some(made) => made,
-            None => Level::new(gpu, &self.keyframe, level)?,
+            None => Level::new(gpu, &self.keyframe, level as u32)?,
         };
         Ok(slot.insert(made))
     }

@@ -1,0 +1,254 @@
+//! What may be wrong about cameras: where they sit, when they look, their lens and their exposure, learned with the splats.
+//!
+//! Terms of a camera are shared by its images; an image may have its own. Nothing is read back: `correct_view` prepares
+//! the view of a step, `refine_camera` takes the step of its terms.
+
+use super::kernels::LearnPipelines;
+use super::params::{CameraRule, Lens, N_TERMS};
+use super::passes::ViewPasses;
+use crate::gpu::{Buffer, Gpu, Passes, Pipeline, f32_of, f32s_of};
+use crate::{Error, Keyframe};
+use kinematics::{Transform, Twist};
+use nalgebra::{Translation3, UnitQuaternion, Vector3};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// Which terms are learned.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct TermSet {
+    /// How each camera is mounted: rotation and translation between camera and what carries it (hand-eye).
+    pub mount: bool,
+    /// By how much the poses of each camera lag behind its images.
+    pub delay: bool,
+    /// Focal lengths and principal point of each camera.
+    pub lens: bool,
+    /// A small pose error of each image.
+    pub image_poses: bool,
+    /// Gains of red, green and blue of each image.
+    pub image_gains: bool,
+}
+
+impl TermSet {
+    /// Whether anything is learned.
+    pub fn any(self) -> bool {
+        self != Self::default()
+    }
+
+    fn of_camera(self) -> u32 {
+        let bits = |on: bool, bits: u32| if on { bits } else { 0 };
+        bits(self.mount, 0b11_1111) | bits(self.delay, 1 << 6) | bits(self.lens, 0b1111 << 7)
+    }
+
+    fn of_image(self) -> u32 {
+        let bits = |on: bool, bits: u32| if on { bits } else { 0 };
+        bits(self.image_poses, 0b11_1111) | bits(self.image_gains, 0b111 << 11)
+    }
+}
+
+/// What was learned about one camera.
+#[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct CameraFix {
+    /// Rotation vector in the camera's own axes, radians: `camera_from_world` becomes turn and shift after it.
+    pub turn_rad: [f64; 3],
+    /// Metres, in the camera's axes.
+    pub shift_m: [f64; 3],
+    /// The poses belong to this much later, seconds.
+    pub delay_secs: f64,
+    /// Logarithm of the factor on the focal lengths.
+    pub log_focal: [f64; 2],
+    /// Shift of the principal point, in focal lengths.
+    pub principal_focals: [f64; 2],
+}
+
+/// A pinhole camera somewhere.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PosedLens {
+    /// Pose.
+    pub world_from_camera: Transform,
+    /// Focal length, pixels.
+    pub focal_px: [f64; 2],
+    /// Principal point, pixels.
+    pub principal_px: [f64; 2],
+}
+
+impl PosedLens {
+    /// As the keyframe has it.
+    pub fn of(keyframe: &Keyframe) -> Self {
+        Self {
+            world_from_camera: keyframe.world_from_camera,
+            focal_px: keyframe.focal_px,
+            principal_px: keyframe.principal_px,
+        }
+    }
+}
+
+impl CameraFix {
+    /// The camera as it is, where the input has it as `lens`; `twist` in the camera's own axes.
+    pub fn apply(&self, lens: &PosedLens, twist: Option<Twist>) -> PosedLens {
+        let moved = |turn: Vector3<f64>, shift: Vector3<f64>| {
+            Transform::from_parts(Translation3::from(shift), UnitQuaternion::from_scaled_axis(turn))
+        };
+        let delay = twist.map_or(Transform::identity(), |twist| {
+            moved(-self.delay_secs * twist.angular_rad_s, -self.delay_secs * twist.linear_m_s)
+        });
+        let mount = moved(self.turn_rad.into(), self.shift_m.into());
+        PosedLens {
+            world_from_camera: (mount * delay * lens.world_from_camera.inverse()).inverse(),
+            focal_px: std::array::from_fn(|axis| lens.focal_px[axis] * self.log_focal[axis].exp()),
+            principal_px: std::array::from_fn(|axis| {
+                lens.principal_px[axis] + self.principal_focals[axis] * lens.focal_px[axis]
+            }),
+        }
+    }
+}
+
+/// Rate of rotations at the start, radians a step; the others follow from it.
+const TURN_RATE: f64 = 3e-4;
+/// What is left of the rates at the end of the plan.
+const FINAL_FRAC: f64 = 0.01;
+const IMAGE_PULL: f64 = 0.01;
+
+/// The terms on the GPU.
+#[derive(Debug)]
+pub(crate) struct CameraTerms {
+    pub(crate) set: TermSet,
+    terms: Buffer,
+    n_slots: u32,
+    rule: Buffer,
+    /// The view of the step at hand.
+    pub(crate) corrected: Buffer,
+    pub(crate) gains: Buffer,
+    cameras: BTreeMap<Arc<str>, u32>,
+    n_used: u32,
+}
+
+impl CameraTerms {
+    pub(crate) fn new(gpu: &Gpu, set: TermSet) -> Result<Self, Error> {
+        Ok(Self {
+            set,
+            terms: gpu.storage("splat.camera_terms", SLOT_BYTES)?,
+            n_slots: 1,
+            rule: gpu.uniform_with("splat.camera_rule", &<CameraRule as bytemuck::Zeroable>::zeroed()),
+            corrected: gpu.uniform_and_storage("splat.corrected_view", size_of::<super::params::View>() as u64),
+            gains: gpu.storage_with("splat.gains", bytemuck::cast_slice(&[1.0f32; 4]))?,
+            cameras: BTreeMap::new(),
+            n_used: 0,
+        })
+    }
+
+    /// The lens of a keyframe, with slots for its camera's terms and its own.
+    pub(crate) fn lens(&mut self, gpu: &Gpu, keyframe: &Keyframe) -> Result<Buffer, Error> {
+        let camera = match self.cameras.get(&keyframe.camera) {
+            Some(slot) => *slot,
+            None => {
+                let slot = self.take_slot(gpu)?;
+                self.cameras.insert(keyframe.camera.clone(), slot);
+                slot
+            }
+        };
+        let image = self.take_slot(gpu)?;
+        let part = |of: fn(&Twist) -> Vector3<f64>| {
+            let [x, y, z] = keyframe.twist.as_ref().map_or([0.0; 3], |twist| f32s_of(of(twist).into()));
+            [x, y, z, 0.0]
+        };
+        let lens = Lens {
+            linear: part(|twist| twist.linear_m_s),
+            angular: part(|twist| twist.angular_rad_s),
+            camera_terms: camera * N_TERMS,
+            image_terms: image * N_TERMS,
+            unused: [0; 2],
+        };
+        Ok(gpu.uniform_with("splat.lens", &lens))
+    }
+
+    fn take_slot(&mut self, gpu: &Gpu) -> Result<u32, Error> {
+        if self.n_used == self.n_slots {
+            let larger = gpu.storage("splat.camera_terms", SLOT_BYTES * u64::from(2 * self.n_slots))?;
+            gpu.copy((&self.terms, 0), (&larger, 0), SLOT_BYTES * u64::from(self.n_slots));
+            self.terms = larger;
+            self.n_slots *= 2;
+        }
+        self.n_used += 1;
+        Ok(self.n_used - 1)
+    }
+
+    /// Says how fast the terms learn; `done` is the share of the plan that lies behind.
+    pub(crate) fn write_rule(&self, gpu: &Gpu, done: f64, scene_size_m: f64) {
+        let rate = TURN_RATE * FINAL_FRAC.powf(done.clamp(0.0, 1.0));
+        let rule = CameraRule {
+            of_camera: self.set.of_camera(),
+            of_image: self.set.of_image(),
+            turn_rate: f32_of(rate),
+            shift_rate_m: f32_of(rate * scene_size_m),
+            delay_rate: f32_of(rate),
+            focal_rate: f32_of(rate),
+            gain_rate: f32_of(10.0 * rate),
+            image_pull: f32_of(IMAGE_PULL),
+        };
+        gpu.write(&self.rule, 0, bytemuck::bytes_of(&rule));
+    }
+
+    /// Lists the pass that prepares the view of a step.
+    pub(crate) fn correct(&self, gpu: &Gpu, passes: &mut Passes, learn: &LearnPipelines, base: &Buffer, lens: &Buffer) {
+        let buffers = [
+            ("base", base),
+            ("lens", lens),
+            ("rule", &self.rule),
+            ("terms", &self.terms),
+            ("corrected", &self.corrected),
+            ("gains", &self.gains),
+        ];
+        passes.dispatch(gpu, &learn.correct_view, 1, &buffers);
+    }
+
+    /// Lists the pass that takes the step of the terms.
+    pub(crate) fn refine(&self, view: &ViewPasses<'_>, passes: &mut Passes, learn: &LearnPipelines, lens: &Buffer) {
+        self.refine_with(view, passes, &learn.refine_camera, lens);
+    }
+
+    pub(crate) fn refine_with(&self, view: &ViewPasses<'_>, passes: &mut Passes, refine: &Pipeline, lens: &Buffer) {
+        let buffers = [
+            ("view", view.view),
+            ("model", &view.splats.model),
+            ("lens", lens),
+            ("rule", &self.rule),
+            ("camera_sums", &view.scratch.camera_sums),
+            ("gain_sums", &view.frame.gain_sums),
+            ("status", view.status),
+            ("terms", &self.terms),
+        ];
+        passes.dispatch(view.gpu, refine, 1, &buffers);
+    }
+
+    /// The values of the first camera's terms.
+    #[cfg(test)]
+    pub(crate) fn slopes(&self, gpu: &Gpu) -> Vec<f64> {
+        let terms: Vec<[f32; 4]> = gpu.read(&self.terms, N_TERMS as usize).unwrap();
+        terms.iter().map(|term| f64::from(term[0])).collect()
+    }
+
+    /// What was learned about each camera.
+    pub(crate) fn fixes(&self, gpu: &Gpu) -> Result<BTreeMap<Arc<str>, CameraFix>, Error> {
+        if !self.set.any() {
+            return Ok(BTreeMap::new());
+        }
+        let terms: Vec<[f32; 4]> = gpu.read(&self.terms, (self.n_used * N_TERMS) as usize)?;
+        let fix = |slot: u32| {
+            let value = |term: u32| {
+                let on = self.set.of_camera() & (1 << term) != 0;
+                if on { f64::from(terms[(slot * N_TERMS + term) as usize][0]) } else { 0.0 }
+            };
+            CameraFix {
+                turn_rad: [value(0), value(1), value(2)],
+                shift_m: [value(3), value(4), value(5)],
+                delay_secs: value(6),
+                log_focal: [value(7), value(8)],
+                principal_focals: [value(9), value(10)],
+            }
+        };
+        Ok(self.cameras.iter().map(|(name, slot)| (name.clone(), fix(*slot))).collect())
+    }
+}
+
+/// Bytes of the terms of one camera, or of one image.
+const SLOT_BYTES: u64 = 16 * N_TERMS as u64;
