@@ -8,7 +8,7 @@ use super::params::{CameraRule, Lens, N_TERMS};
 use super::passes::ViewPasses;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline, f32_of, f32s_of};
 use crate::{Error, Keyframe};
-use kinematics::{Transform, Twist};
+use kinematics::{Stamp, Transform, Twist};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -46,7 +46,7 @@ impl TermSet {
 }
 
 /// What was learned about one camera.
-#[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct CameraFix {
     /// Rotation vector in the camera's own axes, radians: `camera_from_world` becomes turn and shift after it.
     pub turn_rad: [f64; 3],
@@ -58,6 +58,8 @@ pub struct CameraFix {
     pub log_focal: [f64; 2],
     /// Shift of the principal point, in focal lengths.
     pub principal_focals: [f64; 2],
+    /// Turn and shift of the images learned from, by stamp in nanoseconds: between two of them poses drift evenly.
+    pub drift: BTreeMap<i64, [f64; 6]>,
 }
 
 /// A pinhole camera somewhere.
@@ -83,8 +85,23 @@ impl PosedLens {
 }
 
 impl CameraFix {
-    /// The camera as it is, where the input has it as `lens`; `twist` in the camera's own axes.
-    pub fn apply(&self, lens: &PosedLens, twist: Option<Twist>) -> PosedLens {
+    /// Turn and shift at a stamp, from those of the images before and after it.
+    fn drift_at(&self, stamp: Stamp) -> [f64; 6] {
+        let before = self.drift.range(..=stamp.0).next_back();
+        let after = self.drift.range(stamp.0..).next();
+        match (before, after) {
+            (Some((begin, from)), Some((end, to))) if end > begin => {
+                let share = (stamp.0 - begin) as f64 / (end - begin) as f64;
+                std::array::from_fn(|ix| from[ix] + share * (to[ix] - from[ix]))
+            }
+            (Some((_, drift)), _) | (None, Some((_, drift))) => *drift,
+            (None, None) => [0.0; 6],
+        }
+    }
+
+    /// The camera of a keyframe as it is, where the input has it as [`PosedLens::of`].
+    pub fn apply(&self, keyframe: &Keyframe) -> PosedLens {
+        let (lens, twist) = (PosedLens::of(keyframe), keyframe.twist);
         let moved = |turn: Vector3<f64>, shift: Vector3<f64>| {
             Transform::from_parts(Translation3::from(shift), UnitQuaternion::from_scaled_axis(turn))
         };
@@ -92,8 +109,10 @@ impl CameraFix {
             moved(-self.delay_secs * twist.angular_rad_s, -self.delay_secs * twist.linear_m_s)
         });
         let mount = moved(self.turn_rad.into(), self.shift_m.into());
+        let [turn_x, turn_y, turn_z, x, y, z] = self.drift_at(keyframe.stamp);
+        let drift = moved(Vector3::new(turn_x, turn_y, turn_z), Vector3::new(x, y, z));
         PosedLens {
-            world_from_camera: (mount * delay * lens.world_from_camera.inverse()).inverse(),
+            world_from_camera: (mount * drift * delay * lens.world_from_camera.inverse()).inverse(),
             focal_px: std::array::from_fn(|axis| lens.focal_px[axis] * self.log_focal[axis].exp()),
             principal_px: std::array::from_fn(|axis| {
                 lens.principal_px[axis] + self.principal_focals[axis] * lens.focal_px[axis]
@@ -103,10 +122,10 @@ impl CameraFix {
 }
 
 /// Rate of rotations at the start, radians a step; the others follow from it.
-const TURN_RATE: f64 = 3e-4;
+const TURN_RATE: f64 = 1e-3;
 /// What is left of the rates at the end of the plan.
 const FINAL_FRAC: f64 = 0.01;
-const IMAGE_PULL: f64 = 0.01;
+const IMAGE_PULL: f64 = 0.001;
 
 /// The terms on the GPU.
 #[derive(Debug)]
@@ -118,8 +137,15 @@ pub(crate) struct CameraTerms {
     /// The view of the step at hand.
     pub(crate) corrected: Buffer,
     pub(crate) gains: Buffer,
-    cameras: BTreeMap<Arc<str>, u32>,
+    cameras: BTreeMap<Arc<str>, Slots>,
     n_used: u32,
+}
+
+/// Where the terms of a camera and of its images lie, in slots of [`N_TERMS`].
+#[derive(Debug)]
+struct Slots {
+    camera: u32,
+    images: BTreeMap<Stamp, u32>,
 }
 
 impl CameraTerms {
@@ -139,14 +165,16 @@ impl CameraTerms {
     /// The lens of a keyframe, with slots for its camera's terms and its own.
     pub(crate) fn lens(&mut self, gpu: &Gpu, keyframe: &Keyframe) -> Result<Buffer, Error> {
         let camera = match self.cameras.get(&keyframe.camera) {
-            Some(slot) => *slot,
+            Some(slots) => slots.camera,
             None => {
-                let slot = self.take_slot(gpu)?;
-                self.cameras.insert(keyframe.camera.clone(), slot);
-                slot
+                let slots = Slots { camera: self.take_slot(gpu)?, images: BTreeMap::new() };
+                self.cameras.entry(keyframe.camera.clone()).or_insert(slots).camera
             }
         };
         let image = self.take_slot(gpu)?;
+        if let Some(slots) = self.cameras.get_mut(&keyframe.camera) {
+            slots.images.insert(keyframe.stamp, image);
+        }
         let part = |of: fn(&Twist) -> Vector3<f64>| {
             let [x, y, z] = keyframe.twist.as_ref().map_or([0.0; 3], |twist| f32s_of(of(twist).into()));
             [x, y, z, 0.0]
@@ -233,20 +261,27 @@ impl CameraTerms {
             return Ok(BTreeMap::new());
         }
         let terms: Vec<[f32; 4]> = gpu.read(&self.terms, (self.n_used * N_TERMS) as usize)?;
-        let fix = |slot: u32| {
-            let value = |term: u32| {
-                let on = self.set.of_camera() & (1 << term) != 0;
-                if on { f64::from(terms[(slot * N_TERMS + term) as usize][0]) } else { 0.0 }
-            };
+        let value = |slot: u32, term: u32, learned: u32| {
+            let on = learned & (1 << term) != 0;
+            if on { f64::from(terms[(slot * N_TERMS + term) as usize][0]) } else { 0.0 }
+        };
+        let fix = |slots: &Slots| {
+            let of_camera = |term| value(slots.camera, term, self.set.of_camera());
+            let drift = |slot: &u32| std::array::from_fn(|term| value(*slot, term as u32, self.set.of_image()));
             CameraFix {
-                turn_rad: [value(0), value(1), value(2)],
-                shift_m: [value(3), value(4), value(5)],
-                delay_secs: value(6),
-                log_focal: [value(7), value(8)],
-                principal_focals: [value(9), value(10)],
+                turn_rad: std::array::from_fn(|axis| of_camera(axis as u32)),
+                shift_m: std::array::from_fn(|axis| of_camera(3 + axis as u32)),
+                delay_secs: of_camera(6),
+                log_focal: [of_camera(7), of_camera(8)],
+                principal_focals: [of_camera(9), of_camera(10)],
+                drift: if self.set.image_poses {
+                    slots.images.iter().map(|(stamp, slot)| (stamp.0, drift(slot))).collect()
+                } else {
+                    BTreeMap::new()
+                },
             }
         };
-        Ok(self.cameras.iter().map(|(name, slot)| (name.clone(), fix(*slot))).collect())
+        Ok(self.cameras.iter().map(|(name, slots)| (name.clone(), fix(slots))).collect())
     }
 }
 

@@ -614,9 +614,8 @@ impl Method for SplatTrainer {
     }
 
     fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {
-        let lens = PosedLens::of(keyframe);
         let fixes = self.camera_fixes()?;
-        Ok(fixes.get(&keyframe.camera).map_or(lens, |fix| fix.apply(&lens, keyframe.twist)))
+        Ok(fixes.get(&keyframe.camera).map_or_else(|| PosedLens::of(keyframe), |fix| fix.apply(keyframe)))
     }
 
     fn progress(&self) -> Progress {
