@@ -8,7 +8,9 @@ use super::arrays::SplatArrays;
 use crate::gpu::{f32_of, f32s_of};
 use crate::{DepthMap, Keyframe};
 use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
+use rayon::prelude::*;
 use std::collections::HashSet;
+use std::sync::Arc;
 
 /// Neighbours whose depths differ by more than this share lie on different surfaces.
 const EDGE_FRAC: f64 = 0.04;
@@ -31,10 +33,39 @@ pub(crate) struct Seeder {
     places: Vec<Point3<f64>>,
 }
 
+/// A disc that a depth image asks for.
+struct Disc {
+    place: Point3<f64>,
+    spacing_m: f64,
+    normal: Vector3<f64>,
+    size_m: [f64; 3],
+    color: [f64; 3],
+}
+
 impl Seeder {
-    /// Discs for what this keyframe sees and nobody has seen at this fineness.
-    pub(crate) fn discs(&mut self, keyframe: &Keyframe, depth: &DepthMap, n_most: f64, sh_degree: u32) -> SplatArrays {
+    /// Discs for what these keyframes see in their depth and nobody has seen at this fineness; those without depth ask for
+    /// none.
+    ///
+    /// The keyframes come in waves: each looks for what no earlier wave has covered, all at once; then they take their
+    /// places one after the other, so that the result does not depend on how many processors there are.
+    pub(crate) fn discs(&mut self, keyframes: &[Arc<Keyframe>], n_most: f64, sh_degree: u32) -> SplatArrays {
+        const WAVE: usize = 32;
         let mut seeds = Seeds::new(sh_degree);
+        for wave in keyframes.chunks(WAVE) {
+            let asked: Vec<Vec<Disc>> = wave.par_iter().map(|keyframe| self.asked(keyframe, n_most)).collect();
+            for disc in asked.into_iter().flatten() {
+                if self.take(&disc.place, disc.spacing_m) {
+                    seeds.push(&disc.place, &disc.normal, disc.size_m, SEED_OPACITY, disc.color);
+                }
+            }
+        }
+        seeds.arrays
+    }
+
+    /// What one keyframe asks for where nobody has taken the place yet.
+    fn asked(&self, keyframe: &Keyframe, n_most: f64) -> Vec<Disc> {
+        let Some(depth) = &keyframe.depth else { return Vec::new() };
+        let mut discs = Vec::new();
         let [width, height] = depth.size_px;
         let stride = ((f64::from(width) * f64::from(height) / n_most).sqrt().round() as u32).max(1);
         let at = |x: u32, y: u32| f64::from(depth.depth_m[(y * width + x) as usize]);
@@ -57,25 +88,24 @@ impl Seeder {
                 let here = point_in_camera(x, y, z);
                 let spacing_m = f64::from(stride) * z / depth.focal_px[0];
                 let place = depth.world_from_camera * Point3::from(here);
-                let Some(color) = color_at(keyframe, &place) else { continue };
-                if !self.take(&place, spacing_m) {
+                if self.is_taken(&place, spacing_m) {
                     continue;
                 }
+                let Some(color) = color_at(keyframe, &place) else { continue };
                 let filled = |near: f64| if near > 0.0 { near } else { z };
                 let across = point_in_camera(x + stride, y, filled(around[1]))
                     - point_in_camera(x - stride, y, filled(around[0]));
                 let down = point_in_camera(x, y + stride, filled(around[3]))
                     - point_in_camera(x, y - stride, filled(around[2]));
                 let normal = across.cross(&down).try_normalize(1e-12).unwrap_or_else(Vector3::z);
-                let normal_in_world = depth.world_from_camera * normal;
                 // Seen at a slant the grid is wider apart on the surface.
                 let slant = (normal.dot(&here.normalize()).abs()).max(0.3);
-                let size =
+                let size_m =
                     [SPREAD * spacing_m / slant.sqrt(), SPREAD * spacing_m / slant.sqrt(), THICKNESS * spacing_m];
-                seeds.push(&place, &normal_in_world, size, SEED_OPACITY, color);
+                discs.push(Disc { place, spacing_m, normal: depth.world_from_camera * normal, size_m, color });
             }
         }
-        seeds.arrays
+        discs
     }
 
     /// Discs for what a keyframe without depth sees and no disc covers, as far away as the discs around it in the image.
@@ -125,15 +155,26 @@ impl Seeder {
         seeds.arrays
     }
 
+    fn is_taken(&self, place: &Point3<f64>, spacing_m: f64) -> bool {
+        let octave = octave_of(spacing_m);
+        [octave - 1, octave, octave + 1].iter().any(|octave| self.taken.contains(&cell_of(place, *octave)))
+    }
+
     fn take(&mut self, place: &Point3<f64>, spacing_m: f64) -> bool {
-        let octave = spacing_m.log2().round() as i32;
-        let key = |octave: i32| (octave, std::array::from_fn(|axis| (place[axis] / 2f64.powi(octave)).floor() as i32));
-        if [octave - 1, octave, octave + 1].iter().any(|octave| self.taken.contains(&key(*octave))) {
+        if self.is_taken(place, spacing_m) {
             return false;
         }
         self.places.push(*place);
-        self.taken.insert(key(octave))
+        self.taken.insert(cell_of(place, octave_of(spacing_m)))
     }
+}
+
+fn octave_of(spacing_m: f64) -> i32 {
+    spacing_m.log2().round() as i32
+}
+
+fn cell_of(place: &Point3<f64>, octave: i32) -> (i32, [i32; 3]) {
+    (octave, std::array::from_fn(|axis| (place[axis] / 2f64.powi(octave)).floor() as i32))
 }
 
 /// Inverse depth per cell of an image, 0 where none is known.
@@ -321,10 +362,24 @@ mod tests {
     }
 
     #[test]
+    fn many_keyframes_at_once_get_what_they_get_one_by_one() {
+        let keyframes: Vec<Arc<Keyframe>> =
+            (0..40).map(|ix| Arc::new(sees_wall([100 + 8 * (ix % 7), 80 + 4 * (ix % 5)], true))).collect();
+        let at_once = Seeder::default().discs(&keyframes, 2000.0, 0);
+        let mut seeder = Seeder::default();
+        let one_by_one: Vec<[f32; 3]> = keyframes
+            .iter()
+            .flat_map(|keyframe| seeder.discs(std::slice::from_ref(keyframe), 2000.0, 0).means)
+            .collect();
+        assert!(at_once.means.len() > 1500, "{} discs", at_once.means.len());
+        assert_eq!(at_once.means, one_by_one);
+    }
+
+    #[test]
     fn a_camera_without_depth_gets_discs_where_the_others_left_it_bare() {
         let mut seeder = Seeder::default();
         let near = sees_wall([100, 80], true);
-        let seen = seeder.discs(&near, near.depth.as_ref().unwrap(), 2000.0, 0);
+        let seen = seeder.discs(&[Arc::new(near)], 2000.0, 0);
         assert!(seen.means.len() > 1000);
         let wide = sees_wall([200, 80], false);
         let bare = seeder.discs_without_depth(&wide, 4000.0, 7.0, 0);

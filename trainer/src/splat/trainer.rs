@@ -9,11 +9,12 @@ use super::options::SplatOptions;
 use super::params::{Camera, Growth, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{self, GrowthBuffers, Target, ViewPasses};
 use super::seed::{self, Seeder};
-use super::views::TrainView;
+use super::views::{LevelImages, TrainView};
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
 use crate::{Error, Keyframe, Method, Picture, Progress, Projection, RenderRequest, Split, ply};
 use kinematics::Stamp;
-use std::collections::BTreeMap;
+use rayon::prelude::*;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -66,6 +67,8 @@ pub struct SplatTrainer {
     cameras: CameraTerms,
     passes: Passes,
     seeder: Seeder,
+    /// Keyframes whose depth has not been looked at.
+    pending: Vec<Arc<Keyframe>>,
     /// Keyframes without depth since the last step.
     unseeded: Vec<Arc<Keyframe>>,
     seeds_per_image: f64,
@@ -155,6 +158,7 @@ impl SplatTrainer {
             cameras: CameraTerms::new(&gpu, options.camera_terms)?,
             passes: Passes::default(),
             seeder: Seeder::default(),
+            pending: Vec::new(),
             unseeded: Vec::new(),
             seeds_per_image: options
                 .seeds_per_image
@@ -192,6 +196,7 @@ impl SplatTrainer {
 
     /// The splats as they are now.
     pub fn arrays(&mut self) -> Result<SplatArrays, Error> {
+        self.seed_from_depth()?;
         self.settle()?;
         self.splats.read(&self.gpu)
     }
@@ -262,18 +267,21 @@ impl SplatTrainer {
         }
     }
 
-    /// Seeds from keyframes with depth as they come; those without wait for the next step.
-    fn seed_from(&mut self, keyframe: &Arc<Keyframe>) -> Result<(), Error> {
-        let Some(depth) = &keyframe.depth else {
-            self.unseeded.push(keyframe.clone());
+    /// Gives the keyframes since the last call discs where their depth shows something new.
+    fn seed_from_depth(&mut self) -> Result<(), Error> {
+        let pending = std::mem::take(&mut self.pending);
+        if pending.is_empty() {
             return Ok(());
-        };
-        let discs = self.seeder.discs(keyframe, depth, self.seeds_per_image, self.options.sh_degree);
-        self.add(&discs)
+        }
+        let discs = self.seeder.discs(&pending, self.seeds_per_image, self.options.sh_degree);
+        self.add(&discs)?;
+        self.unseeded.extend(pending.into_iter().filter(|keyframe| keyframe.depth.is_none()));
+        Ok(())
     }
 
     /// Keyframes without depth get discs where those with depth left them bare; without any depth there is a cloud.
     fn begin_learning(&mut self) -> Result<(), Error> {
+        self.seed_from_depth()?;
         for keyframe in std::mem::take(&mut self.unseeded) {
             if self.has_depth {
                 let (n_most, default_m) = (self.seeds_per_image, self.scene_size_m);
@@ -339,6 +347,24 @@ impl SplatTrainer {
             unused: 0,
         };
         self.gpu.write(&self.rule, 0, bytemuck::bytes_of(&rule));
+    }
+
+    /// Makes what the next `n` steps look at and was not looked at before, on all processors.
+    fn prepare_levels(&mut self, n: u64) -> Result<(), Error> {
+        let wanted: BTreeSet<(usize, usize)> = (self.step..self.step + n)
+            .map(|step| {
+                let view_ix = pick(step, self.views.len(), self.options.seed);
+                (view_ix, self.views[view_ix].clamped(level_at(step, self.coarse_steps)))
+            })
+            .filter(|(view_ix, level)| !self.views[*view_ix].has_level(*level))
+            .collect();
+        let wanted: Vec<(usize, usize)> = wanted.into_iter().collect();
+        let made: Vec<LevelImages> =
+            wanted.par_iter().map(|(view_ix, level)| LevelImages::new(&self.views[*view_ix].keyframe, *level)).collect();
+        for ((view_ix, level), images) in wanted.into_iter().zip(&made) {
+            self.views[view_ix].upload(&self.gpu, level, images)?;
+        }
+        Ok(())
     }
 
     /// Lists the passes of one step.
@@ -544,7 +570,7 @@ impl Method for SplatTrainer {
         self.has_depth |= keyframe.depth.is_some();
         // What comes late finds at least half of the plan ahead of it: rates that still move things, and growth.
         self.schedule_start = self.schedule_start.max(self.step.saturating_sub(self.options.n_planned_steps / 2));
-        self.seed_from(&keyframe)?;
+        self.pending.push(keyframe.clone());
         self.views.push(TrainView::new(keyframe));
         self.measure_scene();
         Ok(())
@@ -573,6 +599,7 @@ impl Method for SplatTrainer {
         self.splats.set_active_degree(&self.gpu, u32::try_from(self.step / SH_PERIOD).unwrap_or(3).min(3));
         self.write_rule();
         let since = Instant::now();
+        self.prepare_levels(n)?;
         for step in self.step..self.step + n {
             self.record_step(&learn, step)?;
         }
@@ -592,6 +619,7 @@ impl Method for SplatTrainer {
     }
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
+        self.seed_from_depth()?;
         match request.projection {
             Projection::Pinhole { focal_px, principal_px } => {
                 let camera = Camera {

@@ -56,34 +56,54 @@ impl TrainView {
         Ok((self.lens.as_ref(), made))
     }
 
-    fn clamped(&self, level: u32) -> usize {
+    /// No side of an image gets smaller than a tile's.
+    pub(crate) fn clamped(&self, level: u32) -> usize {
         let [width, height] = self.keyframe.size_px;
         level.min((width.min(height) / TILE_PX).max(1).ilog2()) as usize
     }
 
-    /// The keyframe `2^level` times smaller, but no side below a tile's, uploaded at first use.
+    pub(crate) fn has_level(&self, level: usize) -> bool {
+        self.levels[level].is_some()
+    }
+
+    /// Takes the images of a level.
+    pub(crate) fn upload(&mut self, gpu: &Gpu, level: usize, images: &LevelImages) -> Result<(), Error> {
+        self.levels[level] = Some(Level {
+            size_px: images.camera.size_px,
+            view: gpu.uniform_with("splat.view", &images.camera.view()),
+            image: gpu.storage_with("splat.target_image", &images.image)?,
+            depth: gpu.storage_with("splat.target_depth", bytemuck::cast_slice(&images.depth_m))?,
+        });
+        Ok(())
+    }
+
+    /// The keyframe `2^level` times smaller, uploaded at first use.
     pub(crate) fn level(&mut self, gpu: &Gpu, level: u32) -> Result<&Level, Error> {
         let level = self.clamped(level);
-        let slot = &mut self.levels[level];
-        let made = match slot.take() {
-            Some(made) => made,
-            None => Level::new(gpu, &self.keyframe, level as u32)?,
-        };
-        Ok(slot.insert(made))
+        if self.levels[level].is_none() {
+            let images = LevelImages::new(&self.keyframe, level);
+            self.upload(gpu, level, &images)?;
+        }
+        self.levels[level].as_ref().ok_or(Error::DeviceLost)
     }
 }
 
-impl Level {
-    fn new(gpu: &Gpu, keyframe: &Keyframe, level: u32) -> Result<Self, Error> {
-        let camera = camera_of(keyframe).at_level(level);
-        let (image, depth) =
-            (shrunk_image(keyframe, camera.size_px, level), shrunk_depth(keyframe, camera.size_px, level));
-        Ok(Self {
-            size_px: camera.size_px,
-            view: gpu.uniform_with("splat.view", &camera.view()),
-            image: gpu.storage_with("splat.target_image", &image)?,
-            depth: gpu.storage_with("splat.target_depth", bytemuck::cast_slice(&depth))?,
-        })
+/// A keyframe made smaller, in host memory.
+#[derive(Debug)]
+pub(crate) struct LevelImages {
+    camera: Camera,
+    image: Vec<u8>,
+    depth_m: Vec<f32>,
+}
+
+impl LevelImages {
+    pub(crate) fn new(keyframe: &Keyframe, level: usize) -> Self {
+        let camera = camera_of(keyframe).at_level(level as u32);
+        let (image, depth_m) = (
+            shrunk_image(keyframe, camera.size_px, level as u32),
+            shrunk_depth(keyframe, camera.size_px, level as u32),
+        );
+        Self { camera, image, depth_m }
     }
 }
 
