@@ -13,7 +13,7 @@ use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use trainer::Split;
-use trainer::splat::{SplatOptions, TermSet};
+use trainer::splat::{CameraChoice, SplatOptions, TermSet};
 
 /// Flags of `train`.
 #[derive(Debug, clap::Args)]
@@ -28,8 +28,8 @@ pub(crate) struct Args {
     /// Stop after N optimiser steps; no decision reads the clock then
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
-    /// What is learned about cameras along with the scene, separated by commas: mount, delay, lens, image-poses,
-    /// image-gains [default: nothing]
+    /// What is learned about cameras along with the scene: auto (what pays on held-back images), none, or a list of mount,
+    /// delay, lens, image-poses and image-gains, separated by commas [default: auto on a GPU, none on a processor]
     #[arg(long, value_name = "TERMS", value_delimiter = ',', hide_possible_values = true)]
     refine: Vec<Refine>,
     #[command(flatten)]
@@ -70,7 +70,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let evaluators = Evaluators { at_marks: evaluator.clone(), most_at_marks: usize::MAX, at_end: evaluator };
     let data = Data::load(&args.data, &args.images, Purpose::Training, &args.training.overrides(), args.json)?;
     let gpu = super::open_gpu()?;
-    let (kind, options) = args.model(&data)?;
+    let (kind, options) = args.model(&data, gpu.is_software())?;
     let seed = options.seed;
     let mut method = kind.start(gpu.clone(), options)?;
     method.prepare()?;
@@ -106,9 +106,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     Ok(exit::after(&data.losses))
 }
 
-/// A group of terms of `--refine`.
+/// What `--refine` takes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum Refine {
+    Auto,
+    None,
     Mount,
     Delay,
     Lens,
@@ -117,15 +119,28 @@ enum Refine {
 }
 
 impl Args {
-    fn terms(&self) -> TermSet {
+    /// Poses that come from joints are wrong in what all images share, those of a SLAM system drift from image to image.
+    fn cameras(&self, data: &Data, software: bool) -> Result<CameraChoice, BadArgument> {
         let has = |term| self.refine.contains(&term);
-        TermSet {
-            mount: has(Refine::Mount),
-            delay: has(Refine::Delay),
-            lens: has(Refine::Lens),
-            image_poses: has(Refine::ImagePoses),
-            image_gains: has(Refine::ImageGains),
+        if (has(Refine::Auto) || has(Refine::None)) && self.refine.len() > 1 {
+            return Err(BadArgument("--refine: auto and none stand alone".into()));
         }
+        Ok(if has(Refine::Auto) || (self.refine.is_empty() && !software) {
+            let first = if data.rig.is_some() {
+                TermSet { mount: true, delay: true, ..TermSet::default() }
+            } else {
+                TermSet { image_poses: true, ..TermSet::default() }
+            };
+            CameraChoice::Try(vec![first])
+        } else {
+            CameraChoice::Given(TermSet {
+                mount: has(Refine::Mount),
+                delay: has(Refine::Delay),
+                lens: has(Refine::Lens),
+                image_poses: has(Refine::ImagePoses),
+                image_gains: has(Refine::ImageGains),
+            })
+        })
     }
 
     fn limits(&self) -> Result<Limits, BadArgument> {
@@ -138,9 +153,9 @@ impl Args {
     }
 
     /// The scene model: the recording's rig file says which, with the flags over it; a folder has the flags only.
-    fn model(&self, data: &Data) -> Result<(Kind, SplatOptions), BadArgument> {
+    fn model(&self, data: &Data, software: bool) -> Result<(Kind, SplatOptions), BadArgument> {
         if let Some(rig) = &data.rig {
-            let options = SplatOptions { camera_terms: self.terms(), ..options(&rig.train, self.steps)? };
+            let options = SplatOptions { cameras: self.cameras(data, software)?, ..options(&rig.train, self.steps)? };
             return Ok((Kind::of_rig(rig)?, options));
         }
         let usual = SplatOptions::default();
@@ -148,7 +163,7 @@ impl Args {
             seed: self.training.seed.unwrap_or(USUAL_SEED),
             max_splats: self.training.max_splats.map_or(usual.max_splats, |n| n.try_into().unwrap_or(u32::MAX)),
             max_bytes: self.training.max_bytes,
-            camera_terms: self.terms(),
+            cameras: self.cameras(data, software)?,
             n_planned_steps: self.steps.unwrap_or(usual.n_planned_steps),
             ..usual
         };

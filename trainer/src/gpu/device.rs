@@ -141,7 +141,8 @@ impl Gpu {
 
     /// A buffer that one kernel writes and others read as a uniform.
     pub fn uniform_and_storage(&self, label: &str, bytes: u64) -> Buffer {
-        let usage = wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST;
+        let copied = wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST;
+        let usage = wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::STORAGE | copied;
         self.buffer(label, bytes, usage)
     }
 

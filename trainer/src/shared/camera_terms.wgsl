@@ -2,12 +2,7 @@
 //
 // Terms of a camera, shared by all its images, and of a single image are stored alike: 16 a camera, 16 an image.
 
-struct Term {
-    value: f32,
-    first: f32,        // Adam's moments
-    second: f32,
-    n_steps: f32,
-}
+// A term is a vec4f: its value, Adam's two moments, and how many steps it has taken.
 
 const TURN = 0u;           // rotation vector of the camera's own axes, radians
 const SHIFT = 3u;          // metres: camera_from_world becomes turn and shift after camera_from_world

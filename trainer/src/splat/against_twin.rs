@@ -2,16 +2,16 @@
 #![expect(clippy::needless_range_loop, reason = "channels and axes index several arrays at once")]
 
 use super::arrays::SplatArrays;
-use super::camera_terms::{CameraTerms, TermSet};
 use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
+use super::camera_terms::{CameraTerms, TermSet};
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
 use super::reference::{self, RenderedImage, Splat, Upstream, View, scene};
-use crate::{Keyframe, Shutter, Split};
 use crate::gpu::{Buffer, Gpu, GpuOptions, Passes, f32_of};
 use crate::loss::reference as loss_reference;
 use crate::mismatches::Mismatches;
+use crate::{Keyframe, Shutter, Split};
 use kinematics::{Stamp, Transform, Twist};
 use nalgebra::Vector3;
 use std::sync::Arc;
@@ -228,7 +228,13 @@ impl Wanted {
     }
 
     pub(super) fn target(&self) -> Target<'_> {
-        Target { image: &self.image, depth: &self.depth, supervision: &self.supervision, gains: &self.gains, ssim: true }
+        Target {
+            image: &self.image,
+            depth: &self.depth,
+            supervision: &self.supervision,
+            gains: &self.gains,
+            ssim: true,
+        }
     }
 }
 
@@ -461,4 +467,47 @@ fn hostile_splats_are_not_seen_and_do_no_harm() {
     hostile.push(on_camera_plane);
     let (image, depth) = Bench::new(&GpuOptions::default(), &view, &arrays_of(&hostile)).render();
     assert!(image.as_flattened().iter().chain(&depth).all(|value| value.is_finite()));
+}
+
+/// Terms of nothing change nothing; the first step of Adam is as long as the rate, for the terms that are learned only.
+#[test]
+fn terms_of_cameras_start_at_nothing_and_step_by_their_rate() {
+    let view = scene::tilted_view();
+    let splats = scene::small_scene(5, 30);
+    for options in forms() {
+        let bench = Bench::new(&options, &view, &arrays_of(&splats));
+        let gpu = &bench.gpu;
+        let set = TermSet { lens: true, image_gains: true, ..TermSet::default() };
+        let mut cameras = CameraTerms::new(gpu, set).unwrap();
+        let lens = cameras.lens(gpu, &moving_keyframe()).unwrap();
+        cameras.write_rule(gpu, 0.0, 1.0);
+        let target = target_of(&reference::render(&view, &splats), view.size_px);
+        let weights = loss_reference::Weights {
+            dssim_frac: 0.0,
+            depth_per_m: 0.0,
+            depth_clip_m: 1.0,
+            background_rgb: [0.125, 0.25, 0.5],
+        };
+        let wanted = Wanted::new(gpu, &target, &weights);
+        let rule = gpu.uniform_with("rule", &<Rule as bytemuck::Zeroable>::zeroed());
+        let mut passes = Passes::default();
+        cameras.correct(gpu, &mut passes, &bench.learn, &bench.view, &lens);
+        let view_passes = ViewPasses { view: &cameras.corrected, ..bench.passes() };
+        view_passes.draw(&mut passes, &bench.draw);
+        view_passes.compare(&mut passes, &bench.learn, &Target { gains: &cameras.gains, ..wanted.target() });
+        view_passes.backward(&mut passes, &bench.learn);
+        view_passes.update(&mut passes, &bench.learn.update_with_camera, &rule, true);
+        cameras.refine(&view_passes, &mut passes, &bench.learn, &lens);
+        passes.submit(gpu);
+        let corrected: Vec<f32> = gpu.read(&cameras.corrected, 20).unwrap();
+        let base = camera_of(&view).view();
+        for (ix, (got, expected)) in corrected.iter().zip(bytemuck::cast_slice::<_, f32>(&[base])).enumerate() {
+            assert!((got - expected).abs() <= 1e-6 * expected.abs().max(1.0), "word {ix}: {got} for {expected}");
+        }
+        let steps: Vec<f64> = cameras.slopes(gpu);
+        for (term, step) in steps.iter().enumerate() {
+            let rate = if (7..11).contains(&term) { 1e-3 } else { 0.0 };
+            assert!((step.abs() - rate).abs() < 1e-5, "camera term {term} moved by {step}");
+        }
+    }
 }

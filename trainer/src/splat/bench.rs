@@ -187,7 +187,13 @@ impl KernelBench {
         view.compare(
             passes,
             &self.learn,
-            &Target { image: &self.image, depth: &self.depth, supervision: &self.supervision, gains: &self.gains, ssim: false },
+            &Target {
+                image: &self.image,
+                depth: &self.depth,
+                supervision: &self.supervision,
+                gains: &self.gains,
+                ssim: false,
+            },
         );
         view.backward(passes, &self.learn);
         view.update(passes, &self.learn.update, &self.rule, false);

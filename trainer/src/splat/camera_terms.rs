@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// Which terms are learned.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct TermSet {
     /// How each camera is mounted: rotation and translation between camera and what carries it (hand-eye).
     pub mount: bool,
@@ -131,8 +131,7 @@ const IMAGE_PULL: f64 = 0.001;
 #[derive(Debug)]
 pub(crate) struct CameraTerms {
     pub(crate) set: TermSet,
-    terms: Buffer,
-    n_slots: u32,
+    pub(crate) terms: Buffer,
     rule: Buffer,
     /// The view of the step at hand.
     pub(crate) corrected: Buffer,
@@ -153,7 +152,6 @@ impl CameraTerms {
         Ok(Self {
             set,
             terms: gpu.storage("splat.camera_terms", SLOT_BYTES)?,
-            n_slots: 1,
             rule: gpu.uniform_with("splat.camera_rule", &<CameraRule as bytemuck::Zeroable>::zeroed()),
             corrected: gpu.uniform_and_storage("splat.corrected_view", size_of::<super::params::View>() as u64),
             gains: gpu.storage_with("splat.gains", bytemuck::cast_slice(&[1.0f32; 4]))?,
@@ -189,14 +187,21 @@ impl CameraTerms {
         Ok(gpu.uniform_with("splat.lens", &lens))
     }
 
+    /// A copy of all terms.
+    pub(crate) fn copy(&self, gpu: &Gpu) -> Result<Buffer, Error> {
+        let copy = gpu.storage("splat.camera_terms", self.terms.bytes())?;
+        gpu.copy((&self.terms, 0), (&copy, 0), self.terms.bytes());
+        Ok(copy)
+    }
+
     fn take_slot(&mut self, gpu: &Gpu) -> Result<u32, Error> {
-        if self.n_used == self.n_slots {
-            let larger = gpu.storage("splat.camera_terms", SLOT_BYTES * u64::from(2 * self.n_slots))?;
-            gpu.copy((&self.terms, 0), (&larger, 0), SLOT_BYTES * u64::from(self.n_slots));
-            self.terms = larger;
-            self.n_slots *= 2;
-        }
         self.n_used += 1;
+        let bytes = SLOT_BYTES * u64::from(self.n_used);
+        if bytes > self.terms.bytes() {
+            let larger = gpu.storage("splat.camera_terms", 2 * bytes)?;
+            gpu.copy((&self.terms, 0), (&larger, 0), self.terms.bytes());
+            self.terms = larger;
+        }
         Ok(self.n_used - 1)
     }
 
@@ -256,7 +261,7 @@ impl CameraTerms {
     }
 
     /// What was learned about each camera.
-    pub(crate) fn fixes(&self, gpu: &Gpu) -> Result<BTreeMap<Arc<str>, CameraFix>, Error> {
+    pub(crate) fn fixes(&self, gpu: &Gpu) -> Result<BTreeMap<String, CameraFix>, Error> {
         if !self.set.any() {
             return Ok(BTreeMap::new());
         }
@@ -281,7 +286,7 @@ impl CameraTerms {
                 },
             }
         };
-        Ok(self.cameras.iter().map(|(name, slots)| (name.clone(), fix(slots))).collect())
+        Ok(self.cameras.iter().map(|(name, slots)| (name.to_string(), fix(slots))).collect())
     }
 }
 

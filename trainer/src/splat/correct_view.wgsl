@@ -9,17 +9,17 @@
 
 @group(0) @binding(0) var<uniform> base: View;
 @group(0) @binding(1) var<uniform> lens: Lens;
-@group(0) @binding(2) var<storage, read> terms: array<Term>;
+@group(0) @binding(2) var<storage, read> terms: array<vec4f>;
 @group(0) @binding(3) var<storage, read_write> corrected: View;
 @group(0) @binding(4) var<storage, read_write> gains: vec4f;
 @group(0) @binding(5) var<uniform> rule: CameraRule;
 
 fn of_camera(term: u32) -> f32 {
-    return select(0.0, terms[lens.camera_terms + term].value, (rule.of_camera & (1u << term)) != 0u);
+    return select(0.0, terms[lens.camera_terms + term].x, (rule.of_camera & (1u << term)) != 0u);
 }
 
 fn of_image(term: u32) -> f32 {
-    return select(0.0, terms[lens.image_terms + term].value, (rule.of_image & (1u << term)) != 0u);
+    return select(0.0, terms[lens.image_terms + term].x, (rule.of_image & (1u << term)) != 0u);
 }
 
 struct Frame {
@@ -35,7 +35,6 @@ fn moved(frame: Frame, turn: vec3f, shift: vec3f) -> Frame {
 
 @compute @workgroup_size(1)
 fn main() {
-    var view = base;
     let rows = mat4x3f(
         vec3f(base.camera_row_0.x, base.camera_row_1.x, base.camera_row_2.x),
         vec3f(base.camera_row_0.y, base.camera_row_1.y, base.camera_row_2.y),
@@ -47,12 +46,20 @@ fn main() {
     frame = moved(frame, -delay * lens.angular.xyz, -delay * lens.linear.xyz);
     frame = moved(frame, vec3f(of_image(TURN), of_image(TURN + 1u), of_image(TURN + 2u)), vec3f(of_image(SHIFT), of_image(SHIFT + 1u), of_image(SHIFT + 2u)));
     frame = moved(frame, vec3f(of_camera(TURN), of_camera(TURN + 1u), of_camera(TURN + 2u)), vec3f(of_camera(SHIFT), of_camera(SHIFT + 1u), of_camera(SHIFT + 2u)));
-    view.camera_row_0 = vec4f(frame.x.x, frame.y.x, frame.z.x, frame.origin.x);
-    view.camera_row_1 = vec4f(frame.x.y, frame.y.y, frame.z.y, frame.origin.y);
-    view.camera_row_2 = vec4f(frame.x.z, frame.y.z, frame.z.z, frame.origin.z);
-    view.center_in_world = vec4f(-dot(frame.x, frame.origin), -dot(frame.y, frame.origin), -dot(frame.z, frame.origin), base.center_in_world.w);
-    view.focal_px = base.focal_px * exp(vec2f(of_camera(LOG_FOCAL), of_camera(LOG_FOCAL + 1u)));
-    view.principal_px = base.principal_px + base.focal_px * vec2f(of_camera(PRINCIPAL), of_camera(PRINCIPAL + 1u));
-    corrected = view;
+    corrected.camera_row_0 = vec4f(frame.x.x, frame.y.x, frame.z.x, frame.origin.x);
+    corrected.camera_row_1 = vec4f(frame.x.y, frame.y.y, frame.z.y, frame.origin.y);
+    corrected.camera_row_2 = vec4f(frame.x.z, frame.y.z, frame.z.z, frame.origin.z);
+    corrected.center_in_world = vec4f(-dot(frame.x, frame.origin), -dot(frame.y, frame.origin), -dot(frame.z, frame.origin), base.center_in_world.w);
+    corrected.focal_px = base.focal_px * exp(vec2f(of_camera(LOG_FOCAL), of_camera(LOG_FOCAL + 1u)));
+    corrected.principal_px = base.principal_px + base.focal_px * vec2f(of_camera(PRINCIPAL), of_camera(PRINCIPAL + 1u));
+    corrected.size_px = base.size_px;
+    corrected.n_tiles = base.n_tiles;
+    corrected.shutter_linear = base.shutter_linear;
+    corrected.shutter_angular = base.shutter_angular;
+    corrected.crop_row_0 = base.crop_row_0;
+    corrected.crop_row_1 = base.crop_row_1;
+    corrected.crop_row_2 = base.crop_row_2;
+    corrected.crop_min = base.crop_min;
+    corrected.crop_max = base.crop_max;
     gains = exp(vec4f(of_image(LOG_GAIN), of_image(LOG_GAIN + 1u), of_image(LOG_GAIN + 2u), 0.0));
 }

@@ -19,8 +19,10 @@ mod passes;
 pub mod reference;
 mod seed;
 mod trainer;
+mod trials;
 mod views;
 
 pub use camera_terms::{CameraFix, PosedLens, TermSet};
 pub use options::SplatOptions;
 pub use trainer::SplatTrainer;
+pub use trials::{CameraChoice, Trial};

@@ -1,6 +1,6 @@
 //! How a splat model learns.
 
-use super::camera_terms::TermSet;
+use super::trials::CameraChoice;
 
 /// Settings of a [`super::SplatTrainer`].
 #[derive(Clone, Debug, PartialEq)]
@@ -23,7 +23,7 @@ pub struct SplatOptions {
     /// processor, where a step takes as long as the image has pixels.
     pub coarse_steps: Option<[u64; 2]>,
     /// What is learned about cameras.
-    pub camera_terms: TermSet,
+    pub cameras: CameraChoice,
     /// Splats that one depth image may add; `None`: fewer on a processor.
     pub seeds_per_image: Option<f64>,
 }
@@ -39,7 +39,7 @@ impl Default for SplatOptions {
             dssim_frac: 0.2,
             depth_per_m: 0.1,
             coarse_steps: None,
-            camera_terms: TermSet::default(),
+            cameras: CameraChoice::default(),
             seeds_per_image: None,
         }
     }

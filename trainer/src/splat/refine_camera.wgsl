@@ -18,7 +18,7 @@
 @group(0) @binding(3) var<storage, read> camera_sums: array<vec4f>;
 @group(0) @binding(4) var<storage, read> gain_sums: array<vec4f>;
 @group(0) @binding(5) var<storage, read> status: array<u32>;
-@group(0) @binding(6) var<storage, read_write> terms: array<Term>;
+@group(0) @binding(6) var<storage, read_write> terms: array<vec4f>;
 @group(0) @binding(7) var<uniform> rule: CameraRule;
 
 override GRADIENTS_ONLY: bool = false;   // Stored as the terms' values, for tests.
@@ -45,14 +45,12 @@ fn rate_of(term: u32) -> f32 {
     return rule.gain_rate;
 }
 
-fn step_of(before: Term, slope: f32, rate: f32) -> Term {
-    var after = before;
-    after.n_steps += 1.0;
-    after.first = mix(slope, before.first, BETAS.x);
-    after.second = mix(slope * slope, before.second, BETAS.y);
-    let unbiased = vec2f(after.first, after.second) / (1.0 - pow(BETAS, vec2f(after.n_steps)));
-    after.value -= rate * unbiased.x / (sqrt(unbiased.y) + EPSILON);
-    return after;
+fn step_of(before: vec4f, slope: f32, rate: f32, pull: f32) -> vec4f {
+    let moments = mix(vec2f(slope, slope * slope), before.yz, BETAS);
+    let n_steps = before.w + 1.0;
+    let unbiased = moments / (1.0 - pow(BETAS, vec2f(n_steps)));
+    let value = before.x - rate * unbiased.x / (sqrt(unbiased.y) + EPSILON);
+    return vec4f(value * (1.0 - pull), moments, n_steps);
 }
 
 fn finite(x: f32) -> bool {
@@ -86,19 +84,18 @@ fn main(@builtin(local_invocation_index) lane: u32) {
         wg_sums[3] = total[3];
     }
     workgroupBarrier(); // The totals are where `slope_of` looks.
-    if lane >= TERMS || status[FAILED] != 0u { return; } // Past the last barrier.
-    let slope = slope_of(lane);
-    if !finite(slope) { return; }
+    let term = min(lane, TERMS - 1u);
+    let slope = slope_of(term);
+    let learns = lane < TERMS && status[FAILED] == 0u && finite(slope);
+    let bit = 1u << term;
     if GRADIENTS_ONLY {
-        terms[lens.camera_terms + lane].value = slope;
-        return;
-    }
-    if (rule.of_camera & (1u << lane)) != 0u {
-        terms[lens.camera_terms + lane] = step_of(terms[lens.camera_terms + lane], slope, rate_of(lane));
-    }
-    if (rule.of_image & (1u << lane)) != 0u {
-        var term = step_of(terms[lens.image_terms + lane], slope, rate_of(lane));
-        term.value *= 1.0 - rule.image_pull;
-        terms[lens.image_terms + lane] = term;
+        if learns { terms[lens.camera_terms + term].x = slope; }
+    } else {
+        if learns && (rule.of_camera & bit) != 0u {
+            terms[lens.camera_terms + term] = step_of(terms[lens.camera_terms + term], slope, rate_of(term), 0.0);
+        }
+        if learns && (rule.of_image & bit) != 0u {
+            terms[lens.image_terms + term] = step_of(terms[lens.image_terms + term], slope, rate_of(term), rule.image_pull);
+        }
     }
 }

@@ -2,14 +2,16 @@
 #![expect(clippy::cast_possible_truncation, reason = "counts derived from caps that are u32, and bits of a seed")]
 
 use super::arrays::SplatArrays;
-use super::camera_terms::{CameraFix, CameraTerms, PosedLens};
 use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_bins, n_sh_rest, n_tiles};
+use super::camera_terms::{CameraFix, CameraTerms, PosedLens, TermSet};
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::options::SplatOptions;
 use super::params::{Camera, Growth, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{self, GrowthBuffers, Target, ViewPasses};
 use super::seed::{self, Seeder};
-use super::views::{LevelImages, TrainView};
+use super::trials::{CameraChoice, Due, Trial, Trials};
+use super::views::{LevelImages, TrainView, camera_of};
+use crate::eval::{PixelPair, psnr};
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
 use crate::{Error, Keyframe, Method, Picture, Progress, Projection, RenderRequest, Split, ply};
 use kinematics::Stamp;
@@ -65,6 +67,9 @@ pub struct SplatTrainer {
     supervision: Buffer,
     plain: Buffer,
     cameras: CameraTerms,
+    /// Of the saved model this one came from.
+    loaded_fixes: BTreeMap<String, CameraFix>,
+    trials: Trials,
     passes: Passes,
     seeder: Seeder,
     /// Keyframes whose depth has not been looked at.
@@ -116,6 +121,15 @@ impl Drop for Compiling {
     }
 }
 
+/// All that learning changes, to go back to.
+#[derive(Debug)]
+pub(crate) struct State {
+    splats: SplatBuffers,
+    cameras: (TermSet, Buffer),
+    step: u64,
+    grown_at: u64,
+}
+
 #[derive(Debug)]
 struct InFlight {
     status: PendingRead,
@@ -155,7 +169,15 @@ impl SplatTrainer {
                 },
             ),
             plain: gpu.uniform_with("splat.background", &<Supervision as bytemuck::Zeroable>::zeroed()),
-            cameras: CameraTerms::new(&gpu, options.camera_terms)?,
+            cameras: CameraTerms::new(
+                &gpu,
+                match &options.cameras {
+                    CameraChoice::Given(terms) => *terms,
+                    CameraChoice::Try(_) => TermSet::default(),
+                },
+            )?,
+            loaded_fixes: BTreeMap::new(),
+            trials: Trials::new(&options.cameras),
             passes: Passes::default(),
             seeder: Seeder::default(),
             pending: Vec::new(),
@@ -191,7 +213,9 @@ impl SplatTrainer {
     /// Reads what [`Method::save`] wrote.
     pub fn load(gpu: Arc<Gpu>, folder: &Path) -> Result<Self, Error> {
         let arrays = ply::read(&folder.join("splats.ply"))?;
-        Self::from_arrays(gpu, SplatOptions::default(), &arrays)
+        let mut trainer = Self::from_arrays(gpu, SplatOptions::default(), &arrays)?;
+        trainer.loaded_fixes = read_fixes(&folder.join("model.json"))?;
+        Ok(trainer)
     }
 
     /// The splats as they are now.
@@ -202,7 +226,10 @@ impl SplatTrainer {
     }
 
     /// What was learned about each camera; empty where nothing is.
-    pub fn camera_fixes(&mut self) -> Result<BTreeMap<Arc<str>, CameraFix>, Error> {
+    pub fn camera_fixes(&mut self) -> Result<BTreeMap<String, CameraFix>, Error> {
+        if !self.cameras.set.any() {
+            return Ok(self.loaded_fixes.clone());
+        }
         self.settle()?;
         self.cameras.fixes(&self.gpu)
     }
@@ -318,7 +345,8 @@ impl SplatTrainer {
 
     fn write_rule(&self) {
         if self.cameras.set.any() {
-            let done = self.step.saturating_sub(self.schedule_start) as f64 / self.options.n_planned_steps.max(1) as f64;
+            let done =
+                self.step.saturating_sub(self.schedule_start) as f64 / self.options.n_planned_steps.max(1) as f64;
             self.cameras.write_rule(&self.gpu, done, self.scene_size_m);
         }
         let size = f32_of(self.scene_size_m);
@@ -359,8 +387,10 @@ impl SplatTrainer {
             .filter(|(view_ix, level)| !self.views[*view_ix].has_level(*level))
             .collect();
         let wanted: Vec<(usize, usize)> = wanted.into_iter().collect();
-        let made: Vec<LevelImages> =
-            wanted.par_iter().map(|(view_ix, level)| LevelImages::new(&self.views[*view_ix].keyframe, *level)).collect();
+        let made: Vec<LevelImages> = wanted
+            .par_iter()
+            .map(|(view_ix, level)| LevelImages::new(&self.views[*view_ix].keyframe, *level))
+            .collect();
         for ((view_ix, level), images) in wanted.into_iter().zip(&made) {
             self.views[view_ix].upload(&self.gpu, level, images)?;
         }
@@ -521,6 +551,86 @@ impl SplatTrainer {
         Ok(())
     }
 
+    fn state(&self) -> Result<State, Error> {
+        Ok(State {
+            splats: self.splats.grown(&self.gpu, self.splats.capacity)?,
+            cameras: (self.cameras.set, self.cameras.copy(&self.gpu)?),
+            step: self.step,
+            grown_at: self.grown_at,
+        })
+    }
+
+    fn go_back(&mut self, state: State) {
+        self.passes.forget_bindings();
+        (self.splats, self.step, self.grown_at) = (state.splats, state.step, state.grown_at);
+        (self.cameras.set, self.cameras.terms) = state.cameras;
+        self.tell_n();
+        let step = u32::try_from(self.step).unwrap_or(u32::MAX);
+        self.gpu.write(&self.learn_status, 4 * status::STEP as u64, bytemuck::bytes_of(&step));
+    }
+
+    /// Begins, turns and ends trials of what may be learned about cameras.
+    fn try_when_due(&mut self) -> Result<(), Error> {
+        if matches!(self.trials.due(self.step), Due::Nothing) {
+            return Ok(());
+        }
+        self.settle()?;
+        match self.trials.due(self.step) {
+            Due::Nothing => {}
+            Due::Begin => {
+                let state = self.state()?;
+                self.trials.begin(state, self.step, self.views.len());
+            }
+            Due::Turn => {
+                let without_db = self.score_held_back()?;
+                let state = self.state()?;
+                if let Some((from, terms)) = self.trials.turn(state, without_db) {
+                    self.go_back(from);
+                    self.cameras.learn_also(terms);
+                    self.begin_learning()?;
+                }
+            }
+            Due::End => {
+                let with_db = self.score_held_back()?;
+                if let Some(instead) = self.trials.end(&with_db) {
+                    self.go_back(instead);
+                }
+            }
+            Due::Join => {
+                for keyframe in self.trials.settle() {
+                    self.push(keyframe)?;
+                }
+                self.begin_learning()?;
+            }
+        }
+        Ok(())
+    }
+
+    /// PSNR of keyframes that were not learned from, dB; of many, some spread over them.
+    fn score_held_back(&mut self) -> Result<Vec<f64>, Error> {
+        const MOST: usize = 24;
+        let held_back = self.trials.held_back.clone();
+        let stride = held_back.len().div_ceil(MOST).max(1);
+        let mut scores = Vec::new();
+        for keyframe in held_back.iter().step_by(stride) {
+            let lens = self.posed_lens(keyframe)?;
+            let camera = Camera {
+                world_from_camera: lens.world_from_camera,
+                focal_px: lens.focal_px,
+                principal_px: lens.principal_px,
+                ..camera_of(keyframe)
+            };
+            let picture = self.draw_view(&camera, [0.0; 3])?;
+            scores.push(psnr(&PixelPair::new(keyframe.size_px, &picture.rgba_srgb, &keyframe.rgba_srgb)?)?);
+        }
+        Ok(scores)
+    }
+
+    /// How the trials of what may be learned about cameras ended so far.
+    pub fn trials(&self) -> &[Trial] {
+        &self.trials.ended
+    }
+
     /// Draws one pinhole view.
     fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3]) -> Result<Picture, Error> {
         let size_px = camera.size_px;
@@ -566,6 +676,10 @@ impl Method for SplatTrainer {
         if keyframe.split == Split::Test {
             return Ok(());
         }
+        if keyframe.split == Split::Selection && self.trials.hold_back() {
+            self.trials.held_back.push(keyframe);
+            return Ok(());
+        }
         self.settle()?;
         self.has_depth |= keyframe.depth.is_some();
         // What comes late finds at least half of the plan ahead of it: rates that still move things, and growth.
@@ -578,6 +692,7 @@ impl Method for SplatTrainer {
 
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
         self.views.retain(|view| view.keyframe.camera.as_ref() != camera || view.keyframe.stamp != stamp);
+        self.trials.remove(|keyframe| keyframe.camera.as_ref() == camera && keyframe.stamp == stamp);
         self.passes.forget_bindings();
         Ok(())
     }
@@ -591,11 +706,12 @@ impl Method for SplatTrainer {
             return Ok(0);
         }
         let learn = self.learn()?;
+        self.try_when_due()?;
         self.grow_when_due(&learn)?;
         let by_time = if self.step_millis > 0.0 { (SUBMIT_MILLIS / self.step_millis) as u64 } else { 1 };
         let to_change = GROWTH_PERIOD - self.step % GROWTH_PERIOD; // Growth and degrees change at multiples of it.
         let asked = n;
-        let n = n.min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT)).min(to_change);
+        let n = n.min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT)).min(to_change).min(self.trials.steps_left(self.step));
         self.splats.set_active_degree(&self.gpu, u32::try_from(self.step / SH_PERIOD).unwrap_or(3).min(3));
         self.write_rule();
         let since = Instant::now();
@@ -643,7 +759,7 @@ impl Method for SplatTrainer {
 
     fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {
         let fixes = self.camera_fixes()?;
-        Ok(fixes.get(&keyframe.camera).map_or_else(|| PosedLens::of(keyframe), |fix| fix.apply(keyframe)))
+        Ok(fixes.get(keyframe.camera.as_ref()).map_or_else(|| PosedLens::of(keyframe), |fix| fix.apply(keyframe)))
     }
 
     fn progress(&self) -> Progress {
@@ -659,9 +775,35 @@ impl Method for SplatTrainer {
         let arrays = self.arrays()?;
         std::fs::create_dir_all(folder).map_err(|source| Error::Write { path: folder.to_owned(), source })?;
         ply::write(&folder.join("splats.ply"), &arrays)?;
-        let about = serde_json::json!({ "method": "splat", "steps": self.step, "splats": arrays.n_splats(), "sh_degree": arrays.sh_degree, "seed": self.options.seed });
+        let about = serde_json::json!({
+            "method": "splat",
+            "steps": self.step,
+            "splats": arrays.n_splats(),
+            "sh_degree": arrays.sh_degree,
+            "seed": self.options.seed,
+            "trials": self.trials.ended,
+            "cameras": self.camera_fixes()?,
+        });
         let path = folder.join("model.json");
         std::fs::write(&path, format!("{about:#}\n")).map_err(|source| Error::Write { path, source })
+    }
+}
+
+/// What a saved model knows about cameras; a model without such a file, or of an earlier version, knows nothing.
+fn read_fixes(path: &Path) -> Result<BTreeMap<String, CameraFix>, Error> {
+    #[derive(serde::Deserialize)]
+    struct About {
+        #[serde(default)]
+        cameras: BTreeMap<String, CameraFix>,
+    }
+    let refused = |reason: String| Error::SplatFile { path: path.to_owned(), reason };
+    match std::fs::read(path) {
+        Ok(bytes) => {
+            let about: About = serde_json::from_slice(&bytes).map_err(|error| refused(error.to_string()))?;
+            Ok(about.cameras)
+        }
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(BTreeMap::new()),
+        Err(error) => Err(refused(error.to_string())),
     }
 }
 
