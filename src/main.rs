@@ -21,6 +21,7 @@ mod run_folder;
 mod scene_hint;
 mod session;
 mod shrink;
+mod splat_file;
 mod stop;
 mod training_args;
 

@@ -2,7 +2,7 @@
 
 use crate::config::{Rig, Train};
 use crate::exit::BadArgument;
-use anyhow::Context;
+use crate::splat_file;
 use std::path::Path;
 use std::sync::Arc;
 use trainer::Method;
@@ -39,10 +39,10 @@ impl Kind {
     }
 }
 
-/// A saved model.
-pub(crate) fn load(gpu: Arc<Gpu>, folder: &Path) -> anyhow::Result<Box<dyn Method>> {
-    let model = SplatTrainer::load(gpu, folder).with_context(|| format!("no model in {}", folder.display()))?;
-    Ok(Box::new(model))
+/// A saved model: its folder, or a file of splats.
+pub(crate) fn load(gpu: Arc<Gpu>, model: &Path) -> anyhow::Result<Box<dyn Method>> {
+    let splats = splat_file::read(model)?;
+    Ok(Box::new(SplatTrainer::from_arrays(gpu, SplatOptions::default(), &splats)?))
 }
 
 /// The options of a rig file as the trainer wants them; `steps` when their number is settled beforehand.

@@ -13,6 +13,7 @@ pub mod ply;
 pub mod request;
 pub mod sort;
 pub mod splat;
+pub mod spz;
 
 pub use error::Error;
 pub use keyframe::{DepthMap, Keyframe, Split, Truth};

@@ -180,12 +180,6 @@ impl SplatTrainer {
         Ok(trainer)
     }
 
-    /// Reads what [`Method::save`] wrote.
-    pub fn load(gpu: Arc<Gpu>, folder: &Path) -> Result<Self, Error> {
-        let arrays = ply::read(&folder.join("splats.ply"))?;
-        Self::from_arrays(gpu, SplatOptions::default(), &arrays)
-    }
-
     /// The splats as they are now.
     pub fn arrays(&mut self) -> Result<SplatArrays, Error> {
         self.settle()?;
