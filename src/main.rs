@@ -1,6 +1,7 @@
 //! The `fieldrig` command: parse, run, exit code.
 
 mod camera_path;
+mod checkpoints;
 mod cli;
 mod commands;
 mod config;

@@ -5,9 +5,10 @@ use crate::exit::BadArgument;
 use crate::splat_file;
 use std::path::Path;
 use std::sync::Arc;
-use trainer::Method;
+use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
 use trainer::splat::{SplatOptions, SplatTrainer};
+use trainer::{Keyframe, Method};
 
 /// The scene models there are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -37,6 +38,23 @@ impl Kind {
             Self::Splat => Ok(Box::new(SplatTrainer::new(gpu, options)?)),
         }
     }
+}
+
+/// A model that goes on from a checkpoint.
+pub(crate) struct Resumed {
+    pub(crate) kind: Kind,
+    pub(crate) method: Box<dyn Method>,
+    /// Seed and planned steps are those that training began with.
+    pub(crate) options: SplatOptions,
+    /// What it had not learned from: test keyframes, and new ones.
+    pub(crate) rest: Vec<Arc<Keyframe>>,
+}
+
+/// Goes on from a checkpoint; what was learned from must be among the keyframes.
+pub(crate) fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<Resumed> {
+    let (model, rest) = SplatTrainer::resume(gpu, checkpoint, keyframes)?;
+    let options = model.options().clone();
+    Ok(Resumed { kind: Kind::Splat, method: Box::new(model), options, rest })
 }
 
 /// A saved model: its folder, or a file of splats.

@@ -1,7 +1,10 @@
 //! How a splat model learns.
 
+use serde::{Deserialize, Serialize};
+
 /// Settings of a [`super::SplatTrainer`].
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct SplatOptions {
     /// Seeds every random choice.
     pub seed: u64,

@@ -1,6 +1,8 @@
 //! The splat model as a [`Method`]: seeds, steps, growth, pictures.
 #![expect(clippy::cast_possible_truncation, reason = "counts derived from caps that are u32, and bits of a seed")]
 
+mod checkpoint;
+
 use super::arrays::SplatArrays;
 use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_bins, n_sh_rest, n_tiles};
 use super::kernels::{DrawPipelines, LearnPipelines};
@@ -9,6 +11,7 @@ use super::params::{Camera, Growth, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{self, GrowthBuffers, Target, ViewPasses};
 use super::seed::{self, Seeder};
 use super::views::TrainView;
+use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
 use crate::{Error, Keyframe, Method, Picture, Progress, Projection, RenderRequest, Split, ply};
 use kinematics::Stamp;
@@ -184,6 +187,11 @@ impl SplatTrainer {
     pub fn arrays(&mut self) -> Result<SplatArrays, Error> {
         self.settle()?;
         self.splats.read(&self.gpu)
+    }
+
+    /// How it learns.
+    pub fn options(&self) -> &SplatOptions {
+        &self.options
     }
 
     /// Gradients that were not finite and were dropped.
@@ -595,6 +603,10 @@ impl Method for SplatTrainer {
         let about = serde_json::json!({ "method": "splat", "steps": self.step, "splats": arrays.n_splats(), "sh_degree": arrays.sh_degree, "seed": self.options.seed });
         let path = folder.join("model.json");
         std::fs::write(&path, format!("{about:#}\n")).map_err(|source| Error::Write { path, source })
+    }
+
+    fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
+        self.take_checkpoint()
     }
 }
 

@@ -192,3 +192,23 @@ fn what_cannot_be_written_is_told() {
     cloud.means[1][2] = 0.0;
     assert!(matches!(write(&folder.path().join("none/scene.spz"), &cloud), Err(Error::Write { .. })));
 }
+
+#[test]
+fn files_of_another_program_are_read() {
+    let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
+    let data = std::env::var_os("FIELDRIG_TEST_DATA").map_or_else(beside, std::path::PathBuf::from);
+    let folder = data.join("splats");
+    if !folder.is_dir() {
+        eprintln!("skipped: no test data at {}", folder.display());
+        return;
+    }
+    for name in ["minimal-v2.spz", "minimal-v3.spz"] {
+        let splats = read(&folder.join(name)).unwrap();
+        assert_eq!((splats.n_splats(), splats.sh_degree), (4, 0), "{name}");
+        assert!(splats.means.as_flattened().iter().all(|metres| [0.0, 1.0, -1.0].contains(metres)), "{name}");
+        assert!(splats.log_scales.as_flattened().iter().all(|scale| (scale - 0.1_f32.ln()).abs() < 0.04), "{name}");
+        assert!(splats.rotations_wxyz.iter().all(|wxyz| wxyz[0] > 0.999), "{name}: all unturned");
+    }
+    let newer = read(&folder.join("minimal-v4.spz")).unwrap_err().to_string();
+    assert!(newer.ends_with("version 4 of the format, only 2 and 3 are read"), "{newer}");
+}
