@@ -59,7 +59,9 @@ impl Checkpoints {
         if let Err(error) = self.wait() {
             log::warn!("no checkpoint: {error:#}");
         }
+        let asked = Instant::now();
         let pending = method.checkpoint()?;
+        log::debug!("a checkpoint held training up for {:?}", asked.elapsed());
         let path = self.path.clone();
         self.writing = Some(std::thread::spawn(move || write(pending, seconds, &path)));
         self.last = Instant::now();
@@ -77,7 +79,10 @@ impl Checkpoints {
 }
 
 fn write(pending: PendingCheckpoint, seconds: f64, path: &Path) -> Result<(), trainer::Error> {
-    Checkpoint { seconds, ..pending.finish()? }.write(path)
+    let begun = Instant::now();
+    Checkpoint { seconds, ..pending.finish()? }.write(path)?;
+    log::debug!("a checkpoint was written in {:?}", begun.elapsed());
+    Ok(())
 }
 
 #[cfg(test)]

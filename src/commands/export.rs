@@ -32,7 +32,7 @@ pub(crate) struct Args {
 enum Format {
     /// Of a model: its splats as a .ply that other viewers open
     Ply,
-    /// Of a model: its splats as a .spz, which takes a tenth of the room; values are rounded
+    /// Of a model: its splats as a .spz, a tenth as large; values are rounded
     Spz,
     /// Of a recording: a folder with PNG photos, 16-bit depth, transforms.json with poses and split lists
     Nerfstudio,

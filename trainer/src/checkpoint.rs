@@ -1,6 +1,6 @@
 //! The state of training on disk: a file that is whole or not there, and says what it is.
 //!
-//! `docs/checkpoint.md` describes the layout.
+//! `docs/saving.md` describes the layout.
 
 use crate::Error;
 use serde::{Deserialize, Serialize};

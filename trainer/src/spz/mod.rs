@@ -215,8 +215,8 @@ fn plain_bytes(splats: &SplatArrays) -> Result<Vec<u8>, Error> {
         bytes.extend(quantize::smallest_from_rotation([x, y, z, *w]));
     }
     for coefficients in splats.sh.chunks_exact(n_coefficients) {
-        for (ix, (rgb, sign)) in coefficients[1..].iter().zip(SH_SIGNS).enumerate() {
-            bytes.extend(rgb.map(|value| quantize::byte_from_sh(sign * value, ix)));
+        for (rgb, sign) in coefficients[1..].iter().zip(SH_SIGNS) {
+            bytes.extend(rgb.map(|value| quantize::byte_from_sh(sign * value)));
         }
     }
     Ok(bytes)
