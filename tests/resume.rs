@@ -133,7 +133,7 @@ fn a_run_that_is_killed_again_and_again_ends_with_the_same_bits() {
             std::thread::sleep(Duration::from_millis(1));
         }
         // Never at the same point of the rhythm of steps and checkpoints.
-        std::thread::sleep(Duration::from_micros(u64::from(kill * 7919 % 37) * 4000 + 137 * u64::from(kill)));
+        std::thread::sleep(Duration::from_micros(u64::from(kill * 23 % 37) * 8000 + 137 * u64::from(kill)));
         run.kill().unwrap();
         run.wait().unwrap();
         let checkpoint = Checkpoint::read(&file).unwrap();
