@@ -1,6 +1,7 @@
 //! The `fieldrig` command: parse, run, exit code.
 
 mod camera_path;
+mod checkpoints;
 mod cli;
 mod commands;
 mod config;
@@ -21,6 +22,7 @@ mod run_folder;
 mod scene_hint;
 mod session;
 mod shrink;
+mod splat_file;
 mod stop;
 mod training_args;
 

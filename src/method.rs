@@ -2,12 +2,13 @@
 
 use crate::config::{Rig, Train};
 use crate::exit::BadArgument;
-use anyhow::Context;
+use crate::splat_file;
 use std::path::Path;
 use std::sync::Arc;
-use trainer::Method;
+use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
 use trainer::splat::{SplatOptions, SplatTrainer};
+use trainer::{Keyframe, Method};
 
 /// The scene models there are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -39,10 +40,32 @@ impl Kind {
     }
 }
 
-/// A saved model.
-pub(crate) fn load(gpu: Arc<Gpu>, folder: &Path) -> anyhow::Result<Box<dyn Method>> {
-    let model = SplatTrainer::load(gpu, folder).with_context(|| format!("no model in {}", folder.display()))?;
-    Ok(Box::new(model))
+/// A model that goes on from a checkpoint.
+pub(crate) struct Resumed {
+    pub(crate) kind: Kind,
+    pub(crate) method: Box<dyn Method>,
+    /// Seed and planned steps are those that training began with.
+    pub(crate) options: SplatOptions,
+    /// What it had not learned from: test keyframes, and new ones.
+    pub(crate) rest: Vec<Arc<Keyframe>>,
+}
+
+/// Goes on from a checkpoint; what was learned from must be among the keyframes.
+pub(crate) fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<Resumed> {
+    let (model, rest) = SplatTrainer::resume(gpu, checkpoint, keyframes)?;
+    let options = model.options().clone();
+    Ok(Resumed { kind: Kind::Splat, method: Box::new(model), options, rest })
+}
+
+/// A saved model: its folder, or a file of splats.
+pub(crate) fn load(gpu: Arc<Gpu>, model: &Path) -> anyhow::Result<Box<dyn Method>> {
+    let splats = splat_file::read(model)?;
+    let model = if model.is_dir() { Some(model) } else { None };
+    let trainer = SplatTrainer::from_arrays(gpu, SplatOptions::default(), &splats)?;
+    Ok(Box::new(match model {
+        Some(folder) => trainer.with_fixes(folder)?,
+        None => trainer,
+    }))
 }
 
 /// The options of a rig file as the trainer wants them; `steps` when their number is settled beforehand.

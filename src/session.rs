@@ -1,5 +1,6 @@
 //! One model in training: its test keyframes, its clock, and what is told of it.
 
+use crate::checkpoints::Checkpoints;
 use crate::evaluate::{Evaluator, ImageScores, Scores};
 use crate::marks::Marks;
 use crate::{print, run_folder};
@@ -37,6 +38,7 @@ pub(crate) struct Evaluators {
 /// A model in training.
 pub(crate) struct Session {
     pub(crate) method: Box<dyn Method>,
+    checkpoints: Option<Checkpoints>,
     gpu: Arc<Gpu>,
     /// At the marks.
     evaluator: Evaluator,
@@ -60,11 +62,14 @@ pub(crate) struct Session {
 struct Clock {
     started: Option<Instant>,
     excluded: Duration,
+    /// Of the runs that this one goes on from.
+    earlier_secs: f64,
 }
 
 impl Clock {
     fn secs(&self) -> f64 {
-        self.started.map_or(0.0, |started| started.elapsed().saturating_sub(self.excluded).as_secs_f64())
+        let of_this_run = |started: Instant| started.elapsed().saturating_sub(self.excluded).as_secs_f64();
+        self.earlier_secs + self.started.map_or(0.0, of_this_run)
     }
 }
 
@@ -121,6 +126,7 @@ impl Session {
         let template = if length.is_some() { "{bar:30} {elapsed} {msg}" } else { "{spinner} {elapsed} {msg}" };
         Self {
             method,
+            checkpoints: None,
             gpu,
             evaluator: evaluators.at_marks,
             most_at_marks: evaluators.most_at_marks,
@@ -135,6 +141,18 @@ impl Session {
             json,
             bar: print::bar(length, template, json),
         }
+    }
+
+    /// Writes checkpoints, if any, from now on.
+    pub(crate) fn with_checkpoints(self, checkpoints: Option<Checkpoints>) -> Self {
+        Self { checkpoints, ..self }
+    }
+
+    /// Goes on where earlier runs had trained for so long; marks they reached are not told again.
+    pub(crate) fn going_on_after(mut self, earlier_secs: f64) -> Self {
+        self.clock.earlier_secs = earlier_secs;
+        self.marks.reached(earlier_secs);
+        self
     }
 
     /// Starts the clock, unless it runs.
@@ -172,6 +190,10 @@ impl Session {
     pub(crate) fn step(&mut self, n_most: u64) -> anyhow::Result<u64> {
         let left = self.limits.steps.map_or(u64::MAX, |steps| steps.saturating_sub(self.method.progress().step));
         let n = self.method.step(n_most.min(left))?;
+        let seconds = self.secs();
+        if let Some(checkpoints) = &mut self.checkpoints {
+            checkpoints.when_due(self.method.as_mut(), seconds)?;
+        }
         if self.marks.reached(self.secs()) {
             self.tell_mark()?;
         }
@@ -215,6 +237,9 @@ impl Session {
         self.bar.finish_and_clear();
         // Saved before it is scored: a second Ctrl-C during the scoring loses nothing.
         run_folder::save_model(self.method.as_mut(), out)?;
+        if let Some(checkpoints) = &mut self.checkpoints {
+            checkpoints.begin(self.method.as_mut(), seconds)?;
+        }
         let checkpoint_sha256 = run_folder::checkpoint_sha256(out)?;
         std::mem::swap(&mut self.evaluator, &mut self.last_evaluator);
         let per_image = self.score(usize::MAX)?;
@@ -232,8 +257,10 @@ impl Session {
         let report =
             Report { done: &done, adapter: self.gpu.describe(), particulars, marks: &self.told, per_image: &per_image };
         run_folder::write_json(&out.join("report.json"), &report)?;
+        let last_checkpoint = self.checkpoints.as_mut().map_or(Ok(()), Checkpoints::wait);
         if self.json {
-            return print::json(&done);
+            print::json(&done)?;
+            return last_checkpoint;
         }
         print::line(format_args!(
             "{seconds:.1} s, {}, {}, {:.1} MB: {}",
@@ -242,7 +269,8 @@ impl Session {
             done.bytes as f64 / 1e6,
             done.scores
         ))?;
-        Ok(print::line(format_args!("saved in {}", out.display()))?)
+        print::line(format_args!("saved in {}", out.display()))?;
+        last_checkpoint
     }
 
     /// Scores at most `most` test keyframes, off the clock.

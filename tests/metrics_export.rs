@@ -113,7 +113,28 @@ fn a_model_is_exported_as_ply() {
     let said = complaint(&fieldrig(&["export", text(&nothing), "--to", "ply", "--out", text(&out)]), 2);
     assert!(said.contains("nothing does not exist"), "{said}");
     let said = complaint(&fieldrig(&["export", text(folder.path()), "--to", "ply", "--out", text(&out)]), 2);
-    assert!(said.contains("neither a folder with splats.ply nor a recording"), "{said}");
-    let said = complaint(&fieldrig(&["export", text(&out), "--to", "nerfstudio", "--out", text(&nothing)]), 1);
+    assert!(said.contains("neither a folder with splats.ply, nor a file of splats, nor a recording"), "{said}");
+    let other = folder.path().join("other.bin");
+    std::fs::write(&other, b"neither").unwrap();
+    let said = complaint(&fieldrig(&["export", text(&other), "--to", "nerfstudio", "--out", text(&nothing)]), 1);
     assert!(said.contains("is not a recording"), "{said}");
+}
+
+#[test]
+fn a_model_is_exported_as_spz_and_back() {
+    let folder = tempfile::tempdir().unwrap();
+    let [ply_file, spz_file, again] = ["scene.ply", "scene.spz", "again.ply"].map(|name| folder.path().join(name));
+    ply::write(&ply_file, &synthetic_cloud(200, 1)).unwrap();
+    let output = fieldrig(&["export", text(&ply_file), "--to", "spz", "--out", text(&spz_file)]);
+    assert!(output.status.success(), "{output:?}");
+    let bytes = |path: &Path| std::fs::metadata(path).unwrap().len();
+    assert!(4 * bytes(&spz_file) < bytes(&ply_file), "{} of {} bytes", bytes(&spz_file), bytes(&ply_file));
+    let output = fieldrig(&["export", text(&spz_file), "--to", "ply", "--out", text(&again)]);
+    assert!(output.status.success(), "{output:?}");
+    assert_eq!(ply::read(&again).unwrap(), trainer::spz::read(&spz_file).unwrap());
+
+    let whole = std::fs::read(&spz_file).unwrap();
+    std::fs::write(&spz_file, &whole[..whole.len() / 2]).unwrap();
+    let said = complaint(&fieldrig(&["export", text(&spz_file), "--to", "ply", "--out", text(&again)]), 1);
+    assert!(said.contains("scene.spz") && said.contains("cut off"), "{said}");
 }

@@ -13,7 +13,7 @@ use trainer::{Keyframe, Split};
 /// Flags of `eval`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folder of a saved model
+    /// Folder of a saved model, or a file of splats (.ply, .spz)
     model: PathBuf,
     /// The data it was trained on, or other data of the same scene in the same frame
     data: PathBuf,

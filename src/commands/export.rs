@@ -6,23 +6,20 @@ use crate::export::{Written, write_nerfstudio};
 use crate::join::{Join, KeyframeList, Use};
 use crate::open;
 use crate::print::{self, counted};
+use crate::splat_file;
 use anyhow::{Context, ensure};
 use std::path::{Path, PathBuf};
-use trainer::ply;
-
-/// The splats in a model's folder.
-const SPLATS: &str = "splats.ply";
 
 /// Flags of `export`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// A model's folder, or a recording (MCAP)
+    /// A model's folder, a file of splats (.ply, .spz), or a recording (MCAP)
     #[arg(value_name = "MODEL|REC")]
     from: PathBuf,
     /// What to write
     #[arg(long, value_enum)]
     to: Format,
-    /// File (ply) or new folder (nerfstudio) to write
+    /// File (ply, spz) or new folder (nerfstudio) to write
     #[arg(long, value_name = "PATH")]
     out: PathBuf,
     /// Of a recording, export exactly the keyframes this `keyframes.txt` lists [default: those a run would accept]
@@ -35,19 +32,24 @@ pub(crate) struct Args {
 enum Format {
     /// Of a model: its splats as a .ply that other viewers open
     Ply,
+    /// Of a model: its splats as a .spz, a tenth as large; values are rounded
+    Spz,
     /// Of a recording: a folder with PNG photos, 16-bit depth, transforms.json with poses and split lists
     Nerfstudio,
 }
 
 /// Writes the model or recording and says what was written; a recording that ends early is a loss.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let is_model = args.from.join(SPLATS).is_file();
+    let is_model = splat_file::is_one(&args.from);
     ensure!(args.from.exists(), BadArgument(format!("{} does not exist", args.from.display())));
     ensure!(is_model || args.from.is_file(), cannot_export(&args.from));
     match (args.to, is_model) {
-        (Format::Ply, true) => export_ply(&args.from, &args.out),
+        (Format::Ply, true) => export_splats(&args.from, splat_file::Format::Ply, &args.out),
+        (Format::Spz, true) => export_splats(&args.from, splat_file::Format::Spz, &args.out),
         (Format::Nerfstudio, false) => export_recording(args),
-        (Format::Ply, false) => Err(wrong_kind("ply is written of a model's folder, this is a file", &args.from)),
+        (Format::Ply | Format::Spz, false) => {
+            Err(wrong_kind("splats are written of a model, this is a recording", &args.from))
+        }
         (Format::Nerfstudio, true) => {
             Err(wrong_kind("nerfstudio is written of a recording, this is a model", &args.from))
         }
@@ -55,7 +57,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 fn cannot_export(from: &Path) -> BadArgument {
-    BadArgument(format!("{}: neither a folder with {SPLATS} nor a recording", from.display()))
+    BadArgument(format!("{}: neither a folder with splats.ply, nor a file of splats, nor a recording", from.display()))
 }
 
 fn wrong_kind(sentence: &str, from: &Path) -> anyhow::Error {
@@ -63,9 +65,9 @@ fn wrong_kind(sentence: &str, from: &Path) -> anyhow::Error {
 }
 
 /// Checks the splats by reading them before they go out.
-fn export_ply(model: &Path, out: &Path) -> anyhow::Result<Exit> {
-    let splats = ply::read(&model.join(SPLATS))?;
-    ply::write(out, &splats)?;
+fn export_splats(model: &Path, format: splat_file::Format, out: &Path) -> anyhow::Result<Exit> {
+    let splats = splat_file::read(model)?;
+    splat_file::write(out, format, &splats)?;
     let n_splats = counted(splats.n_splats() as u64, "splat");
     print::line(format!("{n_splats} of colour degree {} -> {}", splats.sh_degree, out.display()))?;
     Ok(Exit::Done)

@@ -17,7 +17,7 @@ const MAX_SIDE_PX: u32 = 16_384;
 #[derive(Debug, clap::Args)]
 #[command(group(clap::ArgGroup::new("where").required(true)))]
 pub(crate) struct Args {
-    /// Folder of a saved model
+    /// Folder of a saved model, or a file of splats (.ply, .spz)
     model: PathBuf,
     /// Camera path as nerfstudio writes it (JSON)
     #[arg(long, value_name = "FILE", group = "where")]

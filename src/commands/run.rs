@@ -1,5 +1,6 @@
 //! `fieldrig run`: devices, join, trainer, picture.
 
+use crate::checkpoints::{CheckpointArgs, Checkpoints};
 use crate::config::{ArmDriver, Override, Rig};
 use crate::evaluate::Evaluator;
 use crate::exit::{self, BadArgument, Exit, LackOfEvidence};
@@ -57,6 +58,8 @@ pub(crate) struct Args {
     /// Where the results and the settled rig file go; a folder that holds a model is refused [default: a new folder in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
+    #[command(flatten)]
+    checkpoints: CheckpointArgs,
     /// Print one JSON object a line
     #[arg(long)]
     json: bool,
@@ -112,7 +115,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         at_end: Evaluator::thorough(None)?,
     };
     let limits = Limits { seconds: args.seconds, steps: args.steps };
-    let session = Session::new(gpu, method, evaluators, limits, args.json);
+    let session = Session::new(gpu, method, evaluators, limits, args.json)
+        .with_checkpoints(Checkpoints::new(&out, args.checkpoints));
     let options = LiveOptions { pace, method_name: kind.name(), start_keyframes: rig.join.start_keyframes, notes };
 
     let mut live = Live::new(session, feed, hub, options);

@@ -1,10 +1,12 @@
 //! `fieldrig train`: a model of a dataset folder or a recording.
 
+use crate::checkpoints::{self, CheckpointArgs, Checkpoints};
 use crate::config::USUAL_SEED;
 use crate::data::{Data, DataArgs, Purpose};
 use crate::evaluate::Evaluator;
 use crate::exit::{self, BadArgument, Exit};
-use crate::method::{Kind, options};
+use crate::method::{self, Kind, Resumed, options};
+use crate::print;
 use crate::run_folder;
 use crate::session::{Evaluators, Limits, Session};
 use crate::stop::Stop;
@@ -22,24 +24,32 @@ pub(crate) struct Args {
     data: PathBuf,
     #[command(flatten)]
     training: TrainingArgs,
-    /// Stop after S seconds of training; loading and scoring do not count [default: 120, unless --steps is given]
+    /// Go on from the checkpoint that an earlier run left in this folder, with the same data and its settings
+    #[arg(long, value_name = "FOLDER", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "plan_steps"])]
+    resume: Option<PathBuf>,
+    /// Stop after S seconds of training, those before --resume included; loading and scoring do not count [default: 120, unless --steps is given]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
-    /// Stop after N optimiser steps; no decision reads the clock then
+    /// Stop after N optimiser steps, those before --resume included; no decision reads the clock then
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
     /// What is learned about cameras along with the scene: auto (what pays on held-back images), none, or a list of mount,
     /// delay, lens, image-poses and image-gains, separated by commas [default: auto on a GPU, none on a processor]
     #[arg(long, value_name = "TERMS", value_delimiter = ',', hide_possible_values = true)]
     refine: Vec<Refine>,
+    /// Steps over which learning slows down and the model grows [default: --steps, else 7000]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    plan_steps: Option<u64>,
     #[command(flatten)]
     images: DataArgs,
     /// Weights of LPIPS for `SqueezeNet` (safetensors) [default: what `FIELDRIG_LPIPS_WEIGHTS` names; none: no LPIPS]
     #[arg(long, value_name = "FILE")]
     lpips_weights: Option<PathBuf>,
-    /// Where the results go; a folder that holds a model is refused [default: a new folder in runs]
+    /// Where the results go; a folder that holds a model is refused [default: the folder of --resume if it holds none, else a new one in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
+    #[command(flatten)]
+    checkpoints: CheckpointArgs,
     /// Print one JSON object a line
     #[arg(long)]
     json: bool,
@@ -66,24 +76,32 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         run_folder::refuse_model(out)?;
     }
     let stop = Stop::on_ctrl_c()?;
+    let checkpoint = args.resume.as_deref().map(checkpoints::read).transpose()?;
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
     let evaluators = Evaluators { at_marks: evaluator.clone(), most_at_marks: usize::MAX, at_end: evaluator };
     let data = Data::load(&args.data, &args.images, Purpose::Training, &args.training.overrides(), args.json)?;
     let gpu = super::open_gpu()?;
-    let (kind, options) = args.model(&data, gpu.is_software())?;
-    let seed = options.seed;
-    let mut method = kind.start(gpu.clone(), options)?;
+    let Resumed { kind, mut method, options, rest } = match &checkpoint {
+        Some(checkpoint) => args.resumed(method::resume(gpu.clone(), checkpoint, &data.keyframes)?),
+        None => {
+            let (kind, options) = args.model(&data, gpu.is_software())?;
+            let method = kind.start(gpu.clone(), options.clone())?;
+            Resumed { kind, method, options, rest: data.keyframes.clone() }
+        }
+    };
     method.prepare()?;
-    let out = run_folder::make(args.out.as_deref())?;
+    let out = run_folder::make(args.out())?;
     run_folder::write_keyframe_list(&out.join("keyframes.txt"), &data.keyframes)?;
     if let Some(rig) = &data.rig {
         rig.write_settled(&out)?;
     }
 
-    let mut session = Session::new(gpu, method, evaluators, limits, args.json);
+    let mut session = Session::new(gpu, method, evaluators, limits, args.json)
+        .with_checkpoints(Checkpoints::new(&out, args.checkpoints))
+        .going_on_after(checkpoint.map_or(0.0, |checkpoint| checkpoint.seconds));
     let clock_starts = Instant::now();
     session.start_clock(clock_starts);
-    for keyframe in &data.keyframes {
+    for keyframe in &rest {
         session.push(keyframe)?;
     }
     while !stop.asked() && !session.is_over() {
@@ -95,7 +113,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         &Particulars {
             method: kind.name(),
             data: &args.data,
-            seed,
+            seed: options.seed,
             startup_secs: (clock_starts - started).as_secs_f64(),
             n_train: data.of_split(Split::Train).len(),
             n_selection: data.of_split(Split::Selection).len(),
@@ -152,10 +170,31 @@ impl Args {
         Ok(Limits { seconds, steps: self.steps })
     }
 
+    /// The folder asked for; a run that was cut off goes on in its own.
+    fn out(&self) -> Option<&Path> {
+        let unfinished = || self.resume.as_deref().filter(|folder| run_folder::refuse_model(folder).is_ok());
+        self.out.as_deref().or_else(unfinished)
+    }
+
+    /// Says what is not as the caller may expect.
+    fn resumed(&self, resumed: Resumed) -> Resumed {
+        let (planned, step) = (resumed.options.n_planned_steps, resumed.method.progress().step);
+        log::info!("going on from step {step} of {planned} planned ones");
+        if self.steps.is_some_and(|steps| steps > planned) {
+            log::warn!("learning was planned to slow down over {planned} steps: those past them change little");
+        }
+        let n_new = resumed.rest.iter().filter(|keyframe| keyframe.split != Split::Test).count();
+        if n_new > 0 {
+            log::warn!("{} that the checkpoint does not know", print::counted(n_new as u64, "new image"));
+        }
+        resumed
+    }
+
     /// The scene model: the recording's rig file says which, with the flags over it; a folder has the flags only.
     fn model(&self, data: &Data, software: bool) -> Result<(Kind, SplatOptions), BadArgument> {
         if let Some(rig) = &data.rig {
-            let options = SplatOptions { cameras: self.cameras(data, software)?, ..options(&rig.train, self.steps)? };
+            let plan = self.plan_steps.or(self.steps);
+            let options = SplatOptions { cameras: self.cameras(data, software)?, ..options(&rig.train, plan)? };
             return Ok((Kind::of_rig(rig)?, options));
         }
         let usual = SplatOptions::default();
@@ -164,7 +203,7 @@ impl Args {
             max_splats: self.training.max_splats.map_or(usual.max_splats, |n| n.try_into().unwrap_or(u32::MAX)),
             max_bytes: self.training.max_bytes,
             cameras: self.cameras(data, software)?,
-            n_planned_steps: self.steps.unwrap_or(usual.n_planned_steps),
+            n_planned_steps: self.plan_steps.or(self.steps).unwrap_or(usual.n_planned_steps),
             ..usual
         };
         Ok((self.training.method.unwrap_or(Kind::Splat), options))

@@ -120,6 +120,23 @@ pub enum Error {
         /// What is wrong.
         reason: String,
     },
+    /// A file is no checkpoint, not a whole one, or of another version.
+    #[error("{path:?} is no checkpoint to go on from: {reason}")]
+    Checkpoint {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A whole checkpoint holds a state that this program does not know.
+    #[error("the checkpoint holds no state to go on from: {reason}")]
+    CheckpointState {
+        /// What is wrong.
+        reason: String,
+    },
+    /// A checkpoint belongs to other keyframes.
+    #[error("the checkpoint is of other data: {0}")]
+    CheckpointData(String),
     /// Arrays of splats do not fit together.
     #[error("splats: {0}")]
     SplatArrays(String),

@@ -1,5 +1,6 @@
 //! Radiance fields trained on wgpu: keyframes in, pictures out.
 
+pub mod checkpoint;
 mod error;
 pub mod eval;
 pub mod gpu;
@@ -13,6 +14,7 @@ pub mod ply;
 pub mod request;
 pub mod sort;
 pub mod splat;
+pub mod spz;
 
 pub use error::Error;
 pub use keyframe::{DepthMap, Keyframe, Split, Truth};

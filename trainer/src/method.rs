@@ -1,5 +1,6 @@
 //! What every scene model can do.
 
+use crate::checkpoint::PendingCheckpoint;
 use crate::splat::PosedLens;
 use crate::{Error, Keyframe, Picture, RenderRequest};
 use kinematics::Stamp;
@@ -42,4 +43,6 @@ pub trait Method {
     fn progress(&self) -> Progress;
     /// Writes the model into a folder.
     fn save(&mut self, folder: &Path) -> Result<(), Error>;
+    /// Takes all that training needs to go on from here; what is learned afterwards does not change it.
+    fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error>;
 }

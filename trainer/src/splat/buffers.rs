@@ -12,6 +12,9 @@ pub(crate) const BLOCK: u32 = 256;
 pub(crate) const WINDOW_BINS: u32 = 256;
 pub(crate) const GROUP: u32 = 16;
 
+/// Buffers with an entry a splat.
+pub(crate) const N_PLANED: usize = 9;
+
 /// Floats of the spherical harmonics past the constant one.
 pub(crate) fn n_sh_rest(sh_degree: u32) -> u32 {
     3 * ((sh_degree + 1) * (sh_degree + 1) - 1)
@@ -98,6 +101,11 @@ impl SplatBuffers {
         }
     }
 
+    /// The degree of spherical harmonics in use.
+    pub(crate) fn active_degree(&self) -> u32 {
+        self.active_degree
+    }
+
     fn write_model(&self, gpu: &Gpu) {
         let (sh_degree, n_sh_rest) = (self.active_degree, n_sh_rest(self.active_degree));
         let model = Model { n_splats: self.n_splats, capacity: self.capacity, sh_degree, n_sh_rest };
@@ -172,7 +180,7 @@ impl SplatBuffers {
     }
 
     /// Every per-splat buffer with its planes and bytes an entry.
-    fn planes(&self) -> [(&Buffer, u32, u64); 9] {
+    pub(crate) fn planes(&self) -> [(&Buffer, u32, u64); N_PLANED] {
         let rest = n_sh_rest(self.sh_degree);
         [
             (&self.means, 1, 16),

@@ -6,6 +6,7 @@
 use super::kernels::LearnPipelines;
 use super::params::{CameraRule, Lens, N_TERMS};
 use super::passes::ViewPasses;
+use crate::checkpoint::Checkpoint;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline, f32_of, f32s_of};
 use crate::{Error, Keyframe};
 use kinematics::{Stamp, Transform, Twist};
@@ -140,6 +141,10 @@ pub(crate) struct CameraTerms {
     n_used: u32,
 }
 
+/// Per camera: the slot of its terms, and those of its images by stamp in nanoseconds.
+#[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
+pub(crate) struct CameraSlots(BTreeMap<String, (u32, BTreeMap<i64, u32>)>);
+
 /// Where the terms of a camera and of its images lie, in slots of [`N_TERMS`].
 #[derive(Debug)]
 struct Slots {
@@ -169,7 +174,11 @@ impl CameraTerms {
                 self.cameras.entry(keyframe.camera.clone()).or_insert(slots).camera
             }
         };
-        let image = self.take_slot(gpu)?;
+        let known = self.cameras.get(&keyframe.camera).and_then(|slots| slots.images.get(&keyframe.stamp).copied());
+        let image = match known {
+            Some(slot) => slot,
+            None => self.take_slot(gpu)?,
+        };
         if let Some(slots) = self.cameras.get_mut(&keyframe.camera) {
             slots.images.insert(keyframe.stamp, image);
         }
@@ -258,6 +267,47 @@ impl CameraTerms {
     pub(crate) fn slopes(&self, gpu: &Gpu) -> Vec<f64> {
         let terms: Vec<[f32; 4]> = gpu.read(&self.terms, N_TERMS as usize).unwrap();
         terms.iter().map(|term| f64::from(term[0])).collect()
+    }
+
+    /// Bytes of the slots in use.
+    pub(crate) fn used_bytes(&self) -> u64 {
+        SLOT_BYTES * u64::from(self.n_used)
+    }
+
+    /// Where the terms lie, for a checkpoint.
+    pub(crate) fn slots(&self) -> CameraSlots {
+        let images = |slots: &Slots| slots.images.iter().map(|(stamp, slot)| (stamp.0, *slot)).collect();
+        CameraSlots(
+            self.cameras.iter().map(|(name, slots)| (name.to_string(), (slots.camera, images(slots)))).collect(),
+        )
+    }
+
+    /// Takes over what a checkpoint holds.
+    pub(crate) fn restore(
+        &mut self,
+        gpu: &Gpu,
+        slots: &CameraSlots,
+        set: TermSet,
+        checkpoint: &Checkpoint,
+    ) -> Result<(), Error> {
+        let n_slots: usize = slots.0.values().map(|(_, images)| 1 + images.len()).sum();
+        let all = slots.0.values().flat_map(|(camera, images)| std::iter::once(camera).chain(images.values()));
+        self.n_used = all.map(|slot| slot + 1).max().unwrap_or(0);
+        if (self.n_used as usize) < n_slots {
+            return Err(Error::CheckpointState { reason: "two cameras share their terms".to_owned() });
+        }
+        let bytes = checkpoint.array("camera_terms", self.used_bytes())?;
+        self.terms = gpu.storage_with("splat.camera_terms", bytes)?;
+        self.set = set;
+        self.cameras = slots
+            .0
+            .iter()
+            .map(|(name, (camera, images))| {
+                let images = images.iter().map(|(stamp, slot)| (Stamp(*stamp), *slot)).collect();
+                (Arc::from(name.as_str()), Slots { camera: *camera, images })
+            })
+            .collect();
+        Ok(())
     }
 
     /// What was learned about each camera.

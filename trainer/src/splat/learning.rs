@@ -54,7 +54,7 @@ fn request(world_from_camera: Transform) -> RenderRequest {
     }
 }
 
-fn keyframes(gpu: &Arc<Gpu>, with_depth: bool) -> Vec<Arc<Keyframe>> {
+pub(super) fn keyframes(gpu: &Arc<Gpu>, with_depth: bool) -> Vec<Arc<Keyframe>> {
     n_keyframes(gpu, 10, with_depth)
 }
 
@@ -92,7 +92,7 @@ fn n_keyframes(gpu: &Arc<Gpu>, n: usize, with_depth: bool) -> Vec<Arc<Keyframe>>
         .collect()
 }
 
-fn options() -> SplatOptions {
+pub(super) fn options() -> SplatOptions {
     SplatOptions {
         max_splats: 4000,
         n_planned_steps: 300,
@@ -102,7 +102,7 @@ fn options() -> SplatOptions {
     }
 }
 
-fn train(trainer: &mut SplatTrainer, n_steps: u64) {
+pub(super) fn train(trainer: &mut SplatTrainer, n_steps: u64) {
     let end = trainer.progress().step + n_steps;
     while trainer.progress().step < end {
         trainer.step(end - trainer.progress().step).unwrap();

@@ -17,6 +17,8 @@ mod options;
 mod params;
 mod passes;
 pub mod reference;
+#[cfg(test)]
+mod resuming;
 mod seed;
 mod trainer;
 mod trials;

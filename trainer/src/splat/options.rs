@@ -1,9 +1,11 @@
 //! How a splat model learns.
 
 use super::trials::CameraChoice;
+use serde::{Deserialize, Serialize};
 
 /// Settings of a [`super::SplatTrainer`].
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct SplatOptions {
     /// Seeds every random choice.
     pub seed: u64,

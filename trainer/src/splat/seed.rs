@@ -155,6 +155,31 @@ impl Seeder {
         seeds.arrays
     }
 
+    /// Bytes of a place and of a cell in a checkpoint.
+    pub(crate) const PLACE_BYTES: u64 = 24;
+    pub(crate) const CELL_BYTES: u64 = 16;
+
+    /// How many places have been given splats; each has its place and its cell.
+    pub(crate) fn n_seeds(&self) -> usize {
+        self.places.len()
+    }
+
+    /// A copy of what is remembered.
+    pub(crate) fn remembered(&self) -> Remembered {
+        Remembered { places: self.places.clone(), cells: self.taken.iter().copied().collect() }
+    }
+
+    /// What [`Remembered::into_bytes`] gave, or another whole number of places and cells.
+    pub(crate) fn of_bytes(places: &[u8], cells: &[u8]) -> Self {
+        let places = places.as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes));
+        let cells = cells.as_chunks::<4>().0.iter().map(|bytes| i32::from_le_bytes(*bytes));
+        let (places, cells) = (places.collect::<Vec<_>>(), cells.collect::<Vec<_>>());
+        Self {
+            taken: cells.as_chunks().0.iter().map(|[octave, x, y, z]| (*octave, [*x, *y, *z])).collect(),
+            places: places.as_chunks().0.iter().map(|[x, y, z]| Point3::new(*x, *y, *z)).collect(),
+        }
+    }
+
     fn is_taken(&self, place: &Point3<f64>, spacing_m: f64) -> bool {
         let octave = octave_of(spacing_m);
         [octave - 1, octave, octave + 1].iter().any(|octave| self.taken.contains(&cell_of(place, *octave)))
@@ -175,6 +200,22 @@ fn octave_of(spacing_m: f64) -> i32 {
 
 fn cell_of(place: &Point3<f64>, octave: i32) -> (i32, [i32; 3]) {
     (octave, std::array::from_fn(|axis| (place[axis] / 2f64.powi(octave)).floor() as i32))
+}
+
+/// What a [`Seeder`] remembers, on its way into a checkpoint.
+pub(crate) struct Remembered {
+    places: Vec<Point3<f64>>,
+    cells: Vec<(i32, [i32; 3])>,
+}
+
+impl Remembered {
+    /// Places in the order they were given splats, x y z as f64; cells in ascending order, octave x y z as i32.
+    pub(crate) fn into_bytes(mut self) -> (Vec<u8>, Vec<u8>) {
+        self.cells.sort_unstable();
+        let places = self.places.iter().flat_map(|place| [place.x, place.y, place.z]).flat_map(f64::to_le_bytes);
+        let cells = self.cells.iter().flat_map(|(octave, [x, y, z])| [*octave, *x, *y, *z]).flat_map(i32::to_le_bytes);
+        (places.collect(), cells.collect())
+    }
 }
 
 /// Inverse depth per cell of an image, 0 where none is known.

@@ -1,6 +1,8 @@
 //! The splat model as a [`Method`]: seeds, steps, growth, pictures.
 #![expect(clippy::cast_possible_truncation, reason = "counts derived from caps that are u32, and bits of a seed")]
 
+mod checkpoint;
+
 use super::arrays::SplatArrays;
 use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_bins, n_sh_rest, n_tiles};
 use super::camera_terms::{CameraFix, CameraTerms, PosedLens, TermSet};
@@ -11,6 +13,7 @@ use super::passes::{self, GrowthBuffers, Target, ViewPasses};
 use super::seed::{self, Seeder};
 use super::trials::{CameraChoice, Due, Trial, Trials};
 use super::views::{LevelImages, TrainView, camera_of};
+use crate::checkpoint::PendingCheckpoint;
 use crate::eval::{PixelPair, psnr};
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
 use crate::{Error, Keyframe, Method, Picture, Progress, Projection, RenderRequest, Split, ply};
@@ -124,10 +127,10 @@ impl Drop for Compiling {
 /// All that learning changes, to go back to.
 #[derive(Debug)]
 pub(crate) struct State {
-    splats: SplatBuffers,
-    cameras: (TermSet, Buffer),
-    step: u64,
-    grown_at: u64,
+    pub(super) splats: SplatBuffers,
+    pub(super) cameras: (TermSet, Buffer),
+    pub(super) step: u64,
+    pub(super) grown_at: u64,
 }
 
 #[derive(Debug)]
@@ -210,12 +213,10 @@ impl SplatTrainer {
         Ok(trainer)
     }
 
-    /// Reads what [`Method::save`] wrote.
-    pub fn load(gpu: Arc<Gpu>, folder: &Path) -> Result<Self, Error> {
-        let arrays = ply::read(&folder.join("splats.ply"))?;
-        let mut trainer = Self::from_arrays(gpu, SplatOptions::default(), &arrays)?;
-        trainer.loaded_fixes = read_fixes(&folder.join("model.json"))?;
-        Ok(trainer)
+    /// Knows about cameras what a saved model did, see `model.json`.
+    pub fn with_fixes(mut self, folder: &Path) -> Result<Self, Error> {
+        self.loaded_fixes = read_fixes(&folder.join("model.json"))?;
+        Ok(self)
     }
 
     /// The splats as they are now.
@@ -223,6 +224,11 @@ impl SplatTrainer {
         self.seed_from_depth()?;
         self.settle()?;
         self.splats.read(&self.gpu)
+    }
+
+    /// How it learns.
+    pub fn options(&self) -> &SplatOptions {
+        &self.options
     }
 
     /// What was learned about each camera; empty where nothing is.
@@ -786,6 +792,10 @@ impl Method for SplatTrainer {
         });
         let path = folder.join("model.json");
         std::fs::write(&path, format!("{about:#}\n")).map_err(|source| Error::Write { path, source })
+    }
+
+    fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
+        self.take_checkpoint()
     }
 }
 

@@ -23,7 +23,7 @@ const LEAST_GAIN_DB: f64 = 0.05;
 const LEAST_IMAGES: usize = 4;
 
 /// What is learned about cameras.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub enum CameraChoice {
     /// These terms, from the first step on.
     Given(TermSet),
@@ -175,6 +175,26 @@ impl Trials {
     pub(crate) fn settle(&mut self) -> Vec<Arc<Keyframe>> {
         self.phase = Phase::Settled;
         std::mem::take(&mut self.held_back)
+    }
+
+    /// The state without the candidate, while one is being learned.
+    pub(crate) fn instead(&self) -> Option<&State> {
+        match &self.phase {
+            Phase::With { instead, .. } => Some(instead),
+            _ => None,
+        }
+    }
+
+    /// What is still to be tried; nothing once all is settled.
+    pub(crate) fn untried(&self) -> Vec<TermSet> {
+        if self.hold_back() { self.candidates.iter().copied().collect() } else { Vec::new() }
+    }
+
+    /// Takes over what a checkpoint holds.
+    pub(crate) fn restore(&mut self, untried: Vec<TermSet>, ended: Vec<Trial>) {
+        self.phase = if untried.is_empty() { Phase::Settled } else { Phase::Waiting };
+        self.candidates = untried.into();
+        self.ended = ended;
     }
 
     /// Forgets a keyframe.

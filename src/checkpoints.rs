@@ -1,0 +1,107 @@
+//! Checkpoints of a model in training: taken every so often, written on a thread of their own.
+
+use anyhow::Context;
+use std::path::{Path, PathBuf};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+use trainer::Method;
+use trainer::checkpoint::{Checkpoint, PendingCheckpoint};
+
+/// Name of the checkpoint in the folder of a run.
+const FILE: &str = "training.ckpt";
+
+/// How often checkpoints are written.
+#[derive(Clone, Copy, Debug, clap::Args)]
+pub(crate) struct CheckpointArgs {
+    /// Write all that training needs to go on every S seconds and at the end, for `train --resume`; 0: never
+    #[arg(long, value_name = "S", default_value = "60", value_parser = secs)]
+    checkpoint_secs: Duration,
+}
+
+fn secs(text: &str) -> Result<Duration, String> {
+    let secs = text.parse().ok().and_then(|secs| Duration::try_from_secs_f64(secs).ok());
+    secs.ok_or_else(|| "expected a number of at least 0".to_owned())
+}
+
+/// Reads the checkpoint in the folder of a run.
+pub(crate) fn read(folder: &Path) -> anyhow::Result<Checkpoint> {
+    Checkpoint::read(&folder.join(FILE)).with_context(|| format!("nothing to go on from in {}", folder.display()))
+}
+
+/// The checkpoints of one run; each replaces the one before.
+pub(crate) struct Checkpoints {
+    path: PathBuf,
+    every: Duration,
+    last: Instant,
+    writing: Option<JoinHandle<Result<(), trainer::Error>>>,
+}
+
+impl Checkpoints {
+    /// None where they are not wanted. The first is due after the time between two.
+    pub(crate) fn new(folder: &Path, args: CheckpointArgs) -> Option<Self> {
+        let every = args.checkpoint_secs;
+        (!every.is_zero()).then(|| Self { path: folder.join(FILE), every, last: Instant::now(), writing: None })
+    }
+
+    /// Begins one when it is due and the one before is written. A disk that refuses one does not stop training.
+    pub(crate) fn when_due(&mut self, method: &mut dyn Method, seconds: f64) -> Result<(), trainer::Error> {
+        if self.last.elapsed() < self.every || self.writing.as_ref().is_some_and(|thread| !thread.is_finished()) {
+            return Ok(());
+        }
+        if let Err(error) = self.wait() {
+            log::warn!("no checkpoint, training goes on: {error:#}");
+        }
+        self.begin(method, seconds)
+    }
+
+    /// Begins one of the state as it is now, after the one under way.
+    pub(crate) fn begin(&mut self, method: &mut dyn Method, seconds: f64) -> Result<(), trainer::Error> {
+        if let Err(error) = self.wait() {
+            log::warn!("no checkpoint: {error:#}");
+        }
+        let asked = Instant::now();
+        let pending = method.checkpoint()?;
+        log::debug!("a checkpoint held training up for {:?}", asked.elapsed());
+        let path = self.path.clone();
+        self.writing = Some(std::thread::spawn(move || write(pending, seconds, &path)));
+        self.last = Instant::now();
+        Ok(())
+    }
+
+    /// Waits until the one under way is on the disk.
+    pub(crate) fn wait(&mut self) -> anyhow::Result<()> {
+        let Some(thread) = self.writing.take() else { return Ok(()) };
+        match thread.join() {
+            Ok(written) => Ok(written?),
+            Err(panic) => std::panic::resume_unwind(panic),
+        }
+    }
+}
+
+fn write(pending: PendingCheckpoint, seconds: f64, path: &Path) -> Result<(), trainer::Error> {
+    let begun = Instant::now();
+    Checkpoint { seconds, ..pending.finish()? }.write(path)?;
+    log::debug!("a checkpoint was written in {:?}", begun.elapsed());
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_time_between_two_is_a_number() {
+        assert_eq!(secs("0"), Ok(Duration::ZERO));
+        assert_eq!(secs("0.5"), Ok(Duration::from_millis(500)));
+        for wrong in ["-1", "nan", "inf", "minute", ""] {
+            assert!(secs(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn a_folder_without_a_checkpoint_is_named() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let told = format!("{:#}", read(folder.path()).expect_err("none"));
+        assert!(told.contains(folder.path().to_str().expect("plain")) && told.contains(FILE), "{told}");
+    }
+}

@@ -1,0 +1,150 @@
+//! `fieldrig train --resume`: runs that stopped, or were killed, go on as if they had not.
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+use serde_json::{Value, json};
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant, SystemTime};
+use trainer::checkpoint::Checkpoint;
+
+const N_STEPS: &str = "260";
+const HALF: &str = "130";
+const N_KILLS: u32 = 6;
+const SIZE_PX: [u32; 2] = [64, 48];
+
+/// Ten photos of a patterned wall, taken from places in a row.
+fn dataset(folder: &Path) {
+    let mut frames = Vec::new();
+    for ix in 0..10 {
+        let name = format!("{ix:03}.png");
+        let shade = |x: u32, y: u32| u8::try_from((x / 8 + y / 8 + ix) % 2 * 150 + x).unwrap();
+        let photo = image::RgbImage::from_fn(SIZE_PX[0], SIZE_PX[1], |x, y| {
+            image::Rgb([shade(x, y), shade(y, x), u8::try_from(5 * y).unwrap()])
+        });
+        photo.save(folder.join(&name)).unwrap();
+        let x = 0.05 * f64::from(ix);
+        let pose = [[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 1.0, 2.0], [0.0, 0.0, 0.0, 1.0]];
+        frames.push(json!({ "file_path": name, "transform_matrix": pose }));
+    }
+    let lens = json!({ "w": 64, "h": 48, "fl_x": 60.0, "fl_y": 60.0, "cx": 32.0, "cy": 24.0, "frames": frames });
+    std::fs::write(folder.join("transforms.json"), lens.to_string()).unwrap();
+}
+
+fn train(folder: &Path, args: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
+    command.args(["train", "data", "--json"]).args(args).current_dir(folder);
+    command
+}
+
+/// Trains to the end; what is told last.
+fn done(folder: &Path, args: &[&str]) -> Value {
+    let output = train(folder, args).output().unwrap();
+    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    let told = String::from_utf8(output.stdout).unwrap();
+    let last: Value = serde_json::from_str(told.lines().last().unwrap()).unwrap();
+    assert_eq!(last["event"], "done");
+    last
+}
+
+fn refused(output: &Output, code: i32) -> String {
+    let told = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(code), "{told}");
+    assert!(!told.contains("panicked"), "{told}");
+    told
+}
+
+#[test]
+fn two_halves_give_the_bits_of_the_whole() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    std::fs::create_dir(folder.join("data")).unwrap();
+    dataset(&folder.join("data"));
+    let common = ["--max-splats", "600", "--seed", "3"];
+    let whole = done(folder, &[&["--steps", N_STEPS, "--out", "whole"], &common[..]].concat());
+    let half = done(folder, &[&["--steps", HALF, "--plan-steps", N_STEPS, "--out", "half"], &common[..]].concat());
+    assert_ne!(half["checkpoint_sha256"], whole["checkpoint_sha256"]);
+    let both = done(folder, &["--resume", "half", "--steps", N_STEPS, "--out", "both"]);
+    assert_eq!(both["checkpoint_sha256"], whole["checkpoint_sha256"]);
+    assert_eq!((&both["steps"], &both["psnr"], &both["bytes"]), (&whole["steps"], &whole["psnr"], &whole["bytes"]));
+    assert!(both["seconds"].as_f64() > half["seconds"].as_f64(), "the clock goes on");
+    // The whole state is the same, not only the model: the halves could go on together.
+    let [one, other] = ["whole", "both"].map(|run| Checkpoint::read(&folder.join(run).join("training.ckpt")).unwrap());
+    assert!(one.state == other.state && one.arrays == other.arrays);
+
+    // Nothing is left to do; what there is, is saved. The folder holds a model and is not written to.
+    let again = done(folder, &["--resume", "both", "--steps", N_STEPS, "--checkpoint-secs", "0"]);
+    assert_eq!(again["checkpoint_sha256"], whole["checkpoint_sha256"]);
+    let out = folder.join(again["out"].as_str().unwrap());
+    assert!(out.starts_with(folder.join("runs")) && !out.join("training.ckpt").exists());
+
+    tells_what_it_cannot_go_on_from(folder);
+}
+
+fn tells_what_it_cannot_go_on_from(folder: &Path) {
+    let file = folder.join("half/training.ckpt");
+    let whole = std::fs::read(&file).unwrap();
+    let told = |bytes: &[u8]| {
+        std::fs::write(&file, bytes).unwrap();
+        refused(&train(folder, &["--resume", "half", "--out", "x"]).output().unwrap(), 1)
+    };
+    assert!(told(&whole[..whole.len() / 2]).contains("cut off"));
+    assert!(told(&[&whole[..8], &[9], &whole[9..]].concat()).contains("version 9 of the format, this program reads 1"));
+    let mut damaged = whole.clone();
+    damaged[whole.len() / 2] ^= 1;
+    assert!(told(&damaged).contains("damaged"));
+    std::fs::write(&file, &whole).unwrap();
+    let other_data = |args: &[&str]| {
+        let output = train(folder, &[&["--resume", "half", "--out", "x"], args].concat()).output().unwrap();
+        let told = refused(&output, 1);
+        assert!(told.contains("error: the checkpoint is of other data: image"), "{told}");
+        told
+    };
+    assert!(other_data(&["--scale", "0.5"]).contains("has 32x24 pixels, had 64x48"));
+    assert!(other_data(&["--holdout", "2"]).contains("is not there to be learned from"));
+    for flag in ["--seed", "--max-splats", "--plan-steps"] {
+        assert!(refused(&train(folder, &["--resume", "half", flag, "5"]).output().unwrap(), 2).contains(flag));
+    }
+    let told = refused(&train(folder, &["--resume", "data"]).output().unwrap(), 1);
+    assert!(told.contains("nothing to go on from in data") && told.contains("training.ckpt"), "{told}");
+    assert!(!folder.join("x").exists(), "what is refused leaves nothing behind");
+}
+
+#[test]
+fn a_run_that_is_killed_again_and_again_ends_with_the_same_bits() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    std::fs::create_dir(folder.join("data")).unwrap();
+    dataset(&folder.join("data"));
+    let common = ["--steps", N_STEPS, "--checkpoint-secs", "0.001"];
+    let first = ["--max-splats", "600", "--out", "killed"];
+    let whole = done(folder, &["--steps", N_STEPS, "--max-splats", "600", "--out", "whole"]);
+
+    let file = folder.join("killed/training.ckpt");
+    let changed = || std::fs::metadata(&file).and_then(|about| about.modified()).ok();
+    let resumed = ["--resume", "killed"];
+    let mut steps = Vec::new();
+    for kill in 0..N_KILLS {
+        let from = if file.exists() { &resumed[..] } else { &first[..] };
+        let before: Option<SystemTime> = changed();
+        let mut run = train(folder, &[from, &common[..]].concat()).stdout(Stdio::null()).spawn().unwrap();
+        let spawned = Instant::now();
+        while changed() == before && run.try_wait().unwrap().is_none() {
+            assert!(spawned.elapsed() < Duration::from_secs(120), "no checkpoint");
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        // Never at the same point of the rhythm of steps and checkpoints.
+        std::thread::sleep(Duration::from_micros(u64::from(kill * 23 % 37) * 8000 + 137 * u64::from(kill)));
+        run.kill().unwrap();
+        run.wait().unwrap();
+        let checkpoint = Checkpoint::read(&file).unwrap();
+        steps.push(checkpoint.state["step"].as_u64().unwrap());
+    }
+    assert!(steps.is_sorted() && steps[0] > 0, "{steps:?}");
+    eprintln!("killed at steps {steps:?}");
+    if folder.join("killed/splats.ply").exists() {
+        return; // A machine so fast that it was over before it was killed.
+    }
+    let end = done(folder, &[&resumed[..], &common[..]].concat());
+    assert_eq!(end["checkpoint_sha256"], whole["checkpoint_sha256"]);
+    assert!(folder.join("killed/splats.ply").exists(), "it went on in its own folder");
+}

@@ -1,0 +1,235 @@
+//! Splats in `.spz` files (Niantic): versions 2 and 3 in, version 3 out.
+//!
+//! A gzip stream of a header and, one after the other, the means, opacities, constant colors, scales, rotations and higher
+//! color coefficients of all splats, each value rounded to few bits (`quantize.rs`). Axes there are right, up, back; ours
+//! are those of our `.ply`, which other programs take for right, down, front. So y and z change sign here, exactly as those
+//! programs do it: the same model as `.ply` and as `.spz` lies in the same place in every viewer.
+//!
+//! Source: "SPZ file format", Niantic, versions 2 and 3, <https://github.com/nianticlabs/spz>.
+
+mod quantize;
+
+use crate::Error;
+use crate::splat::arrays::SplatArrays;
+use flate2::Compression;
+use flate2::bufread::GzDecoder;
+use flate2::write::GzEncoder;
+use std::fs::File;
+use std::io::{ErrorKind, Read, Write};
+use std::path::Path;
+
+const MAGIC: [u8; 4] = *b"NGSP";
+const GZIP: [u8; 2] = [0x1f, 0x8b];
+const HEADER_BYTES: usize = 16;
+/// Oldest version that is read: the one before held its means as 16-bit floats.
+const OLDEST: u32 = 2;
+/// Newest version that is read, and the one that is written. Later ones are not gzip streams.
+const NEWEST: u32 = 3;
+/// Bit of the header's flags: more follows the splats.
+const HAS_EXTENSIONS: u8 = 2;
+/// More splats than this are taken for a damaged header.
+const MOST_SPLATS: u32 = 100_000_000;
+/// Most bits behind the point of a mean: steps of 15 micrometres.
+const MOST_FRACTIONAL_BITS: u8 = 16;
+/// Signs of the higher color coefficients when y and z change theirs: negative where the function is odd in them.
+const SH_SIGNS: [f32; 15] = [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
+
+/// Reads a `.spz` of splats.
+pub fn read(path: &Path) -> Result<SplatArrays, Error> {
+    let bytes = std::fs::read(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
+    from_bytes(&bytes).map_err(|reason| Error::SplatFile { path: path.to_owned(), reason })?.checked()
+}
+
+/// Writes a `.spz` of splats; a broken disk leaves no file under this name that looks whole.
+///
+/// Values past what the format holds end at its bounds, except means, which are refused beyond 8388 km.
+pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
+    let plain = plain_bytes(&splats.clone().checked()?)?;
+    let partial = path.with_extension("spz.part");
+    let written = File::create(&partial).and_then(|file| {
+        let mut gzip = GzEncoder::new(file, Compression::default());
+        gzip.write_all(&plain)?;
+        gzip.finish()?.sync_all()?;
+        std::fs::rename(&partial, path)
+    });
+    written.map_err(|source| Error::Write { path: path.to_owned(), source })
+}
+
+/// What the file says before the splats.
+struct Header {
+    version: u32,
+    n_splats: usize,
+    sh_degree: u32,
+    fractional_bits: u8,
+    flags: u8,
+}
+
+impl Header {
+    fn parse(bytes: [u8; HEADER_BYTES]) -> Result<Self, String> {
+        let word = |at: usize| u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]);
+        if bytes[..4] != MAGIC {
+            return Err("what is packed in it does not begin with \"NGSP\"".to_owned());
+        }
+        let (version, n_splats, [sh_degree, fractional_bits, flags, _]) =
+            (word(4), word(8), [bytes[12], bytes[13], bytes[14], bytes[15]]);
+        check_version(version)?;
+        if n_splats > MOST_SPLATS {
+            return Err(format!("the header speaks of {n_splats} splats, at most {MOST_SPLATS} are read"));
+        }
+        if sh_degree > 3 {
+            return Err(format!("colour degree {sh_degree}, at most 3"));
+        }
+        if fractional_bits > 23 {
+            return Err(format!("means with {fractional_bits} fractional bits, at most 23 fit in"));
+        }
+        Ok(Self { version, n_splats: n_splats as usize, sh_degree: sh_degree.into(), fractional_bits, flags })
+    }
+
+    fn n_higher_coefficients(&self) -> usize {
+        (self.sh_degree as usize + 1).pow(2) - 1
+    }
+
+    fn rotation_bytes(&self) -> usize {
+        if self.version == 2 { 3 } else { 4 }
+    }
+
+    /// Bytes of all splats.
+    fn n_body_bytes(&self) -> u64 {
+        self.n_splats as u64 * (16 + self.rotation_bytes() + 3 * self.n_higher_coefficients()) as u64
+    }
+}
+
+fn check_version(version: u32) -> Result<(), String> {
+    match version {
+        OLDEST..=NEWEST => Ok(()),
+        _ => Err(format!("version {version} of the format, only {OLDEST} and {NEWEST} are read")),
+    }
+}
+
+fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {
+    if let [b'N', b'G', b'S', b'P', version @ ..] = bytes
+        && let Some(version) = version.first_chunk()
+    {
+        check_version(u32::from_le_bytes(*version))?;
+    }
+    if !bytes.starts_with(&GZIP) {
+        return Err("it does not begin as a gzip stream".to_owned());
+    }
+    let mut gzip = GzDecoder::new(bytes);
+    let mut header = [0; HEADER_BYTES];
+    gzip.read_exact(&mut header).map_err(|error| damage(&error))?;
+    let header = Header::parse(header)?;
+    let mut body = Vec::new();
+    gzip.by_ref().take(header.n_body_bytes()).read_to_end(&mut body).map_err(|error| damage(&error))?;
+    if (body.len() as u64) < header.n_body_bytes() {
+        let (n_splats, n_bytes) = (header.n_splats, header.n_body_bytes());
+        return Err(format!("cut off: its {n_splats} splats take {n_bytes} bytes, there are {}", body.len()));
+    }
+    // Reading to the end checks the sum of the stream, too.
+    let n_more = std::io::copy(&mut gzip, &mut std::io::sink()).map_err(|error| damage(&error))?;
+    if n_more > 0 && header.flags & HAS_EXTENSIONS == 0 {
+        return Err(format!("{n_more} bytes follow the last splat"));
+    }
+    match gzip.into_inner().len() {
+        0 => Ok(splats(&header, &body)),
+        n => Err(format!("{n} bytes follow the gzip stream")),
+    }
+}
+
+fn damage(error: &std::io::Error) -> String {
+    match error.kind() {
+        ErrorKind::UnexpectedEof => "cut off".to_owned(),
+        _ => format!("damaged ({error})"),
+    }
+}
+
+/// The splats of a body that is as long as the header says.
+fn splats(header: &Header, body: &[u8]) -> SplatArrays {
+    let n_splats = header.n_splats;
+    let mut rest = body;
+    let mut next = |bytes_per_splat: usize| {
+        let (array, after) = rest.split_at(n_splats * bytes_per_splat);
+        rest = after;
+        array
+    };
+    let n_higher = header.n_higher_coefficients();
+    let [means, alphas, colors] = [9, 1, 3].map(&mut next);
+    let [scales, rotations, higher] = [3, header.rotation_bytes(), 3 * n_higher].map(&mut next);
+    let mut sh = Vec::with_capacity(n_splats * (n_higher + 1));
+    for (splat_ix, color) in colors.as_chunks::<3>().0.iter().enumerate() {
+        sh.push(color.map(quantize::color_from_byte));
+        let coefficients = higher[3 * n_higher * splat_ix..][..3 * n_higher].as_chunks::<3>().0;
+        let signed = coefficients.iter().zip(SH_SIGNS);
+        sh.extend(signed.map(|(rgb, sign)| rgb.map(|byte| sign * quantize::sh_from_byte(byte))));
+    }
+    let mean = |bytes: &[u8; 9]| {
+        let [x, y, z] = [0, 3, 6].map(|at| [bytes[at], bytes[at + 1], bytes[at + 2]]);
+        flipped([x, y, z].map(|fixed| quantize::mean_from_fixed(fixed, header.fractional_bits)))
+    };
+    let rotation = |xyzw: [f32; 4]| {
+        let [x, y, z] = flipped([xyzw[0], xyzw[1], xyzw[2]]);
+        [xyzw[3], x, y, z]
+    };
+    let rotations_wxyz = if header.version == 2 {
+        rotations.as_chunks().0.iter().map(|bytes| rotation(quantize::rotation_from_three(*bytes))).collect()
+    } else {
+        rotations.as_chunks().0.iter().map(|bytes| rotation(quantize::rotation_from_smallest(*bytes))).collect()
+    };
+    SplatArrays {
+        means: means.as_chunks().0.iter().map(mean).collect(),
+        log_scales: scales.as_chunks::<3>().0.iter().map(|bytes| bytes.map(quantize::log_scale_from_byte)).collect(),
+        rotations_wxyz,
+        opacity_logits: alphas.iter().map(|byte| quantize::opacity_logit_from_byte(*byte)).collect(),
+        sh,
+        sh_degree: header.sh_degree,
+    }
+}
+
+/// Half a turn about x: ours to theirs, and back.
+fn flipped([x, y, z]: [f32; 3]) -> [f32; 3] {
+    [x, -y, -z]
+}
+
+/// Header and splats before they are packed.
+fn plain_bytes(splats: &SplatArrays) -> Result<Vec<u8>, Error> {
+    let n_splats = u32::try_from(splats.n_splats()).ok().filter(|n| *n <= MOST_SPLATS).ok_or_else(|| {
+        Error::SplatArrays(format!("{} of them, .spz is written of at most {MOST_SPLATS}", splats.n_splats()))
+    })?;
+    let fractional_bits = fractional_bits(&splats.means)?;
+    let mut bytes = MAGIC.to_vec();
+    bytes.extend([NEWEST, n_splats].map(u32::to_le_bytes).as_flattened());
+    bytes.extend([u8::try_from(splats.sh_degree).expect("checked to be at most 3"), fractional_bits, 0, 0]);
+    for mean in &splats.means {
+        bytes.extend(flipped(*mean).map(|metres| quantize::fixed_from_mean(metres, fractional_bits)).as_flattened());
+    }
+    bytes.extend(splats.opacity_logits.iter().map(|logit| quantize::byte_from_opacity_logit(*logit)));
+    let n_coefficients = splats.n_coefficients();
+    for coefficients in splats.sh.chunks_exact(n_coefficients) {
+        bytes.extend(coefficients[0].map(quantize::byte_from_color));
+    }
+    for log_scale in &splats.log_scales {
+        bytes.extend(log_scale.map(quantize::byte_from_log_scale));
+    }
+    for [w, x, y, z] in &splats.rotations_wxyz {
+        let [x, y, z] = flipped([*x, *y, *z]);
+        bytes.extend(quantize::smallest_from_rotation([x, y, z, *w]));
+    }
+    for coefficients in splats.sh.chunks_exact(n_coefficients) {
+        for (rgb, sign) in coefficients[1..].iter().zip(SH_SIGNS) {
+            bytes.extend(rgb.map(|value| quantize::byte_from_sh(sign * value)));
+        }
+    }
+    Ok(bytes)
+}
+
+/// As many bits behind the point as leave room for the mean that is furthest out.
+fn fractional_bits(means: &[[f32; 3]]) -> Result<u8, Error> {
+    let furthest_m = means.as_flattened().iter().map(|metres| f64::from(metres.abs())).fold(0.0, f64::max);
+    let fits = |bits: &u8| furthest_m * f64::from(1_u32 << bits) <= f64::from(quantize::MOST_FIXED);
+    (0..=MOST_FRACTIONAL_BITS).rev().find(fits).ok_or_else(|| {
+        Error::SplatArrays(format!("a mean lies {furthest_m:.0} m out, .spz holds at most {} m", quantize::MOST_FIXED))
+    })
+}
+
+#[cfg(test)]
+mod tests;

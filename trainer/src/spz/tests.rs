@@ -1,0 +1,213 @@
+//! Reading and writing of `.spz` files.
+
+use super::*;
+use crate::splat::cloud::synthetic_cloud;
+use crate::splat::reference::sh;
+use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+
+/// Splats of a cloud, with fewer colour coefficients.
+fn cloud_of_degree(n_splats: usize, sh_degree: u32) -> SplatArrays {
+    let cloud = synthetic_cloud(n_splats, 1);
+    let n_kept = (sh_degree as usize + 1).pow(2);
+    let sh = cloud.sh.chunks_exact(16).flat_map(|splat| splat[..n_kept].to_vec()).collect();
+    SplatArrays { sh, sh_degree, ..cloud }
+}
+
+fn packed(plain: &[u8]) -> Vec<u8> {
+    let mut gzip = GzEncoder::new(Vec::new(), Compression::default());
+    gzip.write_all(plain).unwrap();
+    gzip.finish().unwrap()
+}
+
+fn turn(wxyz: [f32; 4]) -> UnitQuaternion<f64> {
+    let [w, x, y, z] = wxyz.map(f64::from);
+    UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z))
+}
+
+/// Largest difference of two lists.
+fn furthest(what: &str, got: &[f32], expected: &[f32], bound: f32) {
+    assert_eq!(got.len(), expected.len(), "{what}");
+    let worst = got.iter().zip(expected).map(|(got, expected)| (got - expected).abs()).fold(0.0, f32::max);
+    assert!(worst <= bound * 1.0001, "{what}: {worst} off, at most {bound}");
+    assert!(worst > 0.5 * bound, "{what}: {worst} off, the bound {bound} is loose");
+}
+
+#[test]
+fn every_value_survives_within_its_step() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("scene.spz");
+    for sh_degree in 0..=3 {
+        let mut cloud = cloud_of_degree(3000, sh_degree);
+        cloud.means[7] = [-100.0, 60.0, 0.0];
+        write(&path, &cloud).unwrap();
+        let again = read(&path).unwrap();
+        assert_eq!(again.sh_degree, sh_degree);
+        furthest("means", again.means.as_flattened(), cloud.means.as_flattened(), 0.5 / 65536.0);
+        furthest("log scales", again.log_scales.as_flattened(), cloud.log_scales.as_flattened(), 0.5 / 16.0);
+        let opacity = |logits: &[f32]| logits.iter().map(|logit| 1.0 / (1.0 + (-logit).exp())).collect::<Vec<_>>();
+        furthest("opacities", &opacity(&again.opacity_logits), &opacity(&cloud.opacity_logits), 0.5 / 255.0);
+        let turns = again.rotations_wxyz.iter().zip(&cloud.rotations_wxyz);
+        let worst_rad = turns.map(|(a, b)| turn(*a).angle_to(&turn(*b))).fold(0.0, f64::max);
+        assert!(worst_rad < 0.26_f64.to_radians(), "rotations: {} degrees", worst_rad.to_degrees());
+        let coefficients = |cloud: &SplatArrays, functions: std::ops::Range<usize>| -> Vec<f32> {
+            let of_splat = cloud.sh.chunks_exact(cloud.n_coefficients());
+            of_splat.flat_map(|of| of[functions.clone()].as_flattened().to_vec()).collect()
+        };
+        furthest("constant", &coefficients(&again, 0..1), &coefficients(&cloud, 0..1), 0.5 / (255.0 * 0.15));
+        for degree in 1..=sh_degree {
+            let functions = (degree * degree) as usize..((degree + 1) * (degree + 1)) as usize;
+            let expected = coefficients(&cloud, functions.clone());
+            furthest(&format!("degree {degree}"), &coefficients(&again, functions), &expected, 0.5 / 128.0);
+        }
+        // What was rounded once stays as it is, except rotations whose two largest components are nearly the same.
+        write(&path, &again).unwrap();
+        let twice = read(&path).unwrap();
+        assert!(twice.means == again.means && twice.log_scales == again.log_scales && twice.sh == again.sh);
+        assert!(twice.opacity_logits == again.opacity_logits);
+    }
+    write(&path, &SplatArrays::default()).unwrap();
+    assert_eq!(read(&path).unwrap().n_splats(), 0);
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no partial file stays");
+}
+
+/// Every byte of a file of one splat, worked out by hand from the description of the format.
+#[test]
+fn a_file_of_one_splat_has_the_bytes_of_the_format() {
+    let splat = SplatArrays {
+        means: vec![[1.0, -2.0, 3.0]],
+        log_scales: vec![[-10.0, -3.0, 5.9375]],
+        // A quarter of a turn about y, with the other sign and twice the length.
+        rotations_wxyz: vec![[-2.0, 0.0, -2.0, 0.0]],
+        opacity_logits: vec![0.0],
+        sh: vec![[0.0, 1.0, -9.0], [0.25, 0.5, -0.5], [0.0, 1.0, -1.0], [0.125, 0.0, 0.0]],
+        sh_degree: 1,
+    };
+    #[rustfmt::skip]
+    let expected = [
+        b'N', b'G', b'S', b'P', 3, 0, 0, 0, 1, 0, 0, 0, 1, 16, 0, 0, // One splat of degree 1, 16 bits behind the point.
+        0x00, 0x00, 0x01, 0x00, 0x00, 0x02, 0x00, 0x00, 0xfd,        // 1, 2 and -3 times 2^16: y and z are turned.
+        128,                                                         // Half of 255, rounded up.
+        128, 166, 0,                                                 // 127.5 + 38.25 each, and past the lower end.
+        0, 112, 255,                                                 // 16 (log scale + 10)
+        // x = 0, -y = -1/sqrt(2), -z = 0, w = 1/sqrt(2): y is the first of the two largest, so signs turn and it goes.
+        0xff, 0x03, 0x00, 0x40,                                      // 01, x 0 0, z 0 0, w 1 511
+        96, 64, 192,                                                 // -y: 128 - 32, - 64, + 64
+        128, 0, 255,                                                 // -z: 128, - 128, + 128 past the upper end
+        144, 128, 128,                                               // x: 128 + 16
+    ];
+    assert_eq!(plain_bytes(&splat).unwrap(), expected);
+    let again = from_bytes(&packed(&expected)).unwrap().checked().unwrap();
+    assert_eq!((again.means[0], again.log_scales[0]), (splat.means[0], splat.log_scales[0]));
+    assert!(turn(again.rotations_wxyz[0]).angle_to(&turn(splat.rotations_wxyz[0])) < 1e-3);
+    assert_eq!(again.sh[1..], [[0.25, 0.5, -0.5], [0.0, 1.0, -0.992_187_5], [0.125, 0.0, 0.0]]);
+
+    let mut older = expected.to_vec();
+    older[4] = 2;
+    older.splice(32..36, [128, 38, 128]); // x and z about 0, y: 127.5 (1 - 1/sqrt(2)).
+    let again = from_bytes(&packed(&older)).unwrap().checked().unwrap();
+    assert!(turn(again.rotations_wxyz[0]).angle_to(&turn(splat.rotations_wxyz[0])).to_degrees() < 1.5);
+}
+
+/// Colors seen along a direction are those of the turned splat seen along the turned direction.
+#[test]
+fn colors_turn_with_the_axes() {
+    let coefficients: Vec<[f64; 3]> = synthetic_cloud(1, 5).sh.iter().map(|rgb| rgb.map(f64::from)).collect();
+    let mut turned = coefficients.clone();
+    for (rgb, sign) in turned[1..].iter_mut().zip(SH_SIGNS) {
+        *rgb = rgb.map(|value| f64::from(sign) * value);
+    }
+    for offset in [Vector3::new(0.3, -0.5, 0.8), Vector3::new(-0.9, 0.2, 0.1), Vector3::new(0.1, 0.7, -0.6)] {
+        let there = sh::color(&turned, &Vector3::new(offset.x, -offset.y, -offset.z));
+        for (here, there) in sh::color(&coefficients, &offset).iter().zip(there) {
+            assert!((here - there).abs() < 1e-12);
+        }
+    }
+}
+
+#[test]
+fn broken_files_are_refused_with_the_reason() {
+    let plain = plain_bytes(&cloud_of_degree(5, 2)).unwrap();
+    let whole = packed(&plain);
+    assert!(from_bytes(&whole).is_ok());
+    let complaint = |bytes: &[u8]| from_bytes(bytes).unwrap_err();
+    let changed = |at: usize, to: u8| {
+        let mut plain = plain.clone();
+        plain[at] = to;
+        complaint(&packed(&plain))
+    };
+    assert_eq!(complaint(b"ply\n"), "it does not begin as a gzip stream");
+    assert_eq!(complaint(b""), "it does not begin as a gzip stream");
+    assert_eq!(complaint(b"NGSP\x04\0\0\0rest"), "version 4 of the format, only 2 and 3 are read");
+    assert!(complaint(&plain).contains("gzip"));
+    assert_eq!(changed(0, b'X'), "what is packed in it does not begin with \"NGSP\"");
+    assert_eq!(changed(4, 1), "version 1 of the format, only 2 and 3 are read");
+    assert_eq!(changed(8, 6), "cut off: its 6 splats take 264 bytes, there are 220");
+    assert_eq!(changed(8, 4), "44 bytes follow the last splat");
+    assert!(changed(11, 255).contains("4278190085 splats, at most 100000000"));
+    assert!(changed(11, 5).contains("cut off: its 83886085 splats"));
+    assert_eq!(changed(12, 4), "colour degree 4, at most 3");
+    assert!(changed(12, 3).contains("cut off"));
+    assert!(changed(13, 32).contains("32 fractional bits"));
+    assert_eq!(complaint(&packed(&plain[..7])), "cut off");
+    for length in 2..whole.len() {
+        assert!(complaint(&whole[..length]).contains("cut off"), "{length} of {} bytes", whole.len());
+    }
+    assert_eq!(complaint(&[&whole[..], b"tail"].concat()), "4 bytes follow the gzip stream");
+    let mut damaged = whole.clone();
+    let sum_at = damaged.len() - 8;
+    damaged[sum_at] ^= 1;
+    assert!(complaint(&damaged).starts_with("damaged ("));
+    let mut extended = [&plain[..], b"what other programs add"].concat();
+    assert_eq!(complaint(&packed(&extended)), "23 bytes follow the last splat");
+    extended[14] = HAS_EXTENSIONS;
+    assert!(from_bytes(&packed(&extended)).is_ok());
+}
+
+#[test]
+fn any_bytes_decode_to_finite_splats() {
+    for version in [2, 3] {
+        for value in [0, 1, 127, 128, 255] {
+            let mut plain = plain_bytes(&cloud_of_degree(3, 3)).unwrap();
+            plain[HEADER_BYTES..].fill(value);
+            plain[4] = version;
+            plain.truncate(HEADER_BYTES + 3 * if version == 2 { 64 } else { 65 });
+            from_bytes(&packed(&plain)).unwrap().checked().unwrap();
+        }
+    }
+}
+
+#[test]
+fn what_cannot_be_written_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("scene.spz");
+    let mut cloud = cloud_of_degree(3, 0);
+    cloud.means[1][2] = 9e6;
+    assert!(write(&path, &cloud).unwrap_err().to_string().contains("9000000 m out"));
+    cloud.means[1][2] = 8e6;
+    write(&path, &cloud).unwrap();
+    assert!((read(&path).unwrap().means[1][2] - 8e6).abs() < 1.0);
+    cloud.means[1][2] = f32::NAN;
+    assert_eq!(write(&path, &cloud).unwrap_err().to_string(), "splats: mean of splat 1 is not finite");
+    cloud.means[1][2] = 0.0;
+    assert!(matches!(write(&folder.path().join("none/scene.spz"), &cloud), Err(Error::Write { .. })));
+}
+
+#[test]
+fn files_of_another_program_are_read() {
+    let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
+    let data = std::env::var_os("FIELDRIG_TEST_DATA").map_or_else(beside, std::path::PathBuf::from);
+    let folder = data.join("splats");
+    if !folder.is_dir() {
+        eprintln!("skipped: no test data at {}", folder.display());
+        return;
+    }
+    for name in ["minimal-v2.spz", "minimal-v3.spz"] {
+        let splats = read(&folder.join(name)).unwrap();
+        assert_eq!((splats.n_splats(), splats.sh_degree), (4, 0), "{name}");
+        assert!(splats.means.as_flattened().iter().all(|metres| [0.0, 1.0, -1.0].contains(metres)), "{name}");
+        assert!(splats.log_scales.as_flattened().iter().all(|scale| (scale - 0.1_f32.ln()).abs() < 0.04), "{name}");
+        assert!(splats.rotations_wxyz.iter().all(|wxyz| wxyz[0] > 0.999), "{name}: all unturned");
+    }
+    let newer = read(&folder.join("minimal-v4.spz")).unwrap_err().to_string();
+    assert!(newer.ends_with("version 4 of the format, only 2 and 3 are read"), "{newer}");
+}
