@@ -22,6 +22,7 @@ mod scene_hint;
 mod session;
 mod shrink;
 mod stop;
+mod training;
 mod training_args;
 
 use clap::Parser;

@@ -8,7 +8,7 @@ use crate::join::{Counts, Join, Refusal, Use};
 use crate::live::{Live, LiveOptions, Pace};
 use crate::method::{self, Kind};
 use crate::open::{self, Devices, Opened};
-use crate::session::{Evaluators, Limits, Session};
+use crate::session::{Evaluators, Limits, Session, Tell};
 use crate::stop::Stop;
 use crate::training_args::TrainingArgs;
 use crate::{print, run_folder};
@@ -112,7 +112,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         at_end: Evaluator::thorough(None)?,
     };
     let limits = Limits { seconds: args.seconds, steps: args.steps };
-    let session = Session::new(gpu, method, evaluators, limits, args.json);
+    let session = Session::new(gpu, method, evaluators, limits, Tell::of_command(args.json));
     let options = LiveOptions { pace, method_name: kind.name(), start_keyframes: rig.join.start_keyframes, notes };
 
     let mut live = Live::new(session, feed, hub, options);

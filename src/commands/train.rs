@@ -1,19 +1,20 @@
 //! `fieldrig train`: a model of a dataset folder or a recording.
 
-use crate::config::USUAL_SEED;
 use crate::data::{Data, DataArgs, Purpose};
 use crate::evaluate::Evaluator;
-use crate::exit::{self, BadArgument, Exit};
-use crate::method::{Kind, options};
+use crate::exit::{self, Exit};
 use crate::run_folder;
-use crate::session::{Evaluators, Limits, Session};
+use crate::session::{Evaluators, Tell};
 use crate::stop::Stop;
+use crate::training::{self, Plan};
 use crate::training_args::TrainingArgs;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use trainer::Split;
-use trainer::splat::SplatOptions;
+
+/// Length of a training where no flag says.
+const USUAL_SECONDS: f64 = 120.0;
 
 /// Flags of `train`.
 #[derive(Debug, clap::Args)]
@@ -57,7 +58,7 @@ struct Particulars<'a> {
 /// Loads, trains until a limit or Ctrl-C, scores at the marks, saves.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let started = Instant::now();
-    let limits = args.limits()?;
+    let limits = training::limits(args.seconds, args.steps, USUAL_SECONDS)?;
     if let Some(out) = &args.out {
         run_folder::refuse_model(out)?;
     }
@@ -66,33 +67,25 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let evaluators = Evaluators { at_marks: evaluator.clone(), most_at_marks: usize::MAX, at_end: evaluator };
     let data = Data::load(&args.data, &args.images, Purpose::Training, &args.training.overrides(), args.json)?;
     let gpu = super::open_gpu()?;
-    let (kind, options) = args.model(&data)?;
+    let (kind, options) = training::model(&args.training, &data, args.steps)?;
     let seed = options.seed;
-    let mut method = kind.start(gpu.clone(), options)?;
-    method.prepare()?;
     let out = run_folder::make(args.out.as_deref())?;
     run_folder::write_keyframe_list(&out.join("keyframes.txt"), &data.keyframes)?;
     if let Some(rig) = &data.rig {
         rig.write_settled(&out)?;
     }
 
-    let mut session = Session::new(gpu, method, evaluators, limits, args.json);
-    let clock_starts = Instant::now();
-    session.start_clock(clock_starts);
-    for keyframe in &data.keyframes {
-        session.push(keyframe)?;
-    }
-    while !stop.asked() && !session.is_over() {
-        session.step(u64::MAX)?;
-    }
+    let plan = Plan { kind, options, evaluators, limits, tell: Tell::of_command(args.json) };
+    let session = training::train(gpu, plan, &data.keyframes, &stop)?;
 
+    let startup_secs = session.clock_started().map_or(0.0, |at| (at - started).as_secs_f64());
     session.finish(
         &out,
         &Particulars {
             method: kind.name(),
             data: &args.data,
             seed,
-            startup_secs: (clock_starts - started).as_secs_f64(),
+            startup_secs,
             n_train: data.of_split(Split::Train).len(),
             n_selection: data.of_split(Split::Selection).len(),
             n_test: data.of_split(Split::Test).len(),
@@ -100,31 +93,4 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         },
     )?;
     Ok(exit::after(&data.losses))
-}
-
-impl Args {
-    fn limits(&self) -> Result<Limits, BadArgument> {
-        const USUAL_SECONDS: f64 = 120.0;
-        if self.seconds.is_some_and(|seconds| seconds.is_nan() || seconds < 0.0) {
-            return Err(BadArgument("--seconds: must be a number of at least 0".into()));
-        }
-        let seconds = self.seconds.or(self.steps.is_none().then_some(USUAL_SECONDS));
-        Ok(Limits { seconds, steps: self.steps })
-    }
-
-    /// The scene model: the recording's rig file says which, with the flags over it; a folder has the flags only.
-    fn model(&self, data: &Data) -> Result<(Kind, SplatOptions), BadArgument> {
-        if let Some(rig) = &data.rig {
-            return Ok((Kind::of_rig(rig)?, options(&rig.train, self.steps)?));
-        }
-        let usual = SplatOptions::default();
-        let options = SplatOptions {
-            seed: self.training.seed.unwrap_or(USUAL_SEED),
-            max_splats: self.training.max_splats.map_or(usual.max_splats, |n| n.try_into().unwrap_or(u32::MAX)),
-            max_bytes: self.training.max_bytes,
-            n_planned_steps: self.steps.unwrap_or(usual.n_planned_steps),
-            ..usual
-        };
-        Ok((self.training.method.unwrap_or(Kind::Splat), options))
-    }
 }
