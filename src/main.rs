@@ -1,6 +1,8 @@
 //! The `fieldrig` command: parse, run, exit code.
 
+mod bench;
 mod camera_path;
+mod chart;
 mod cli;
 mod commands;
 mod config;
