@@ -184,7 +184,7 @@ fn clock_offset(keyframes: &[Arc<Keyframe>], offset_nanos: f64) -> Vec<Arc<Keyfr
     })
 }
 
-/// Pose and velocity at a time, between the two neighbouring states; past the ends the nearest motion goes on.
+/// Pose and velocity at a time, between the two neighboring states; past the ends the nearest motion goes on.
 fn at(trajectory: &Trajectory, nanos: f64) -> Option<(Transform, Option<Twist>)> {
     let next = trajectory.partition_point(|(stamp, ..)| (stamp.0 as f64) < nanos);
     let next = next.clamp(1, trajectory.len().checked_sub(1).filter(|last| *last > 0)?);
@@ -376,12 +376,12 @@ mod tests {
     fn exposure_is_multiplied_in_linear_light() {
         assert!(exposed(1.0).iter().enumerate().all(|(byte, after)| byte == *after as usize));
         let doubled = exposed(2.0);
-        // 128 is 0.2159 of the light; 0.4317 is 175. 188 is just above half of the light.
-        assert_eq!((doubled[0], doubled[128], doubled[188], doubled[255]), (0, 175, 255, 255));
+        // 128 is 0.2159 of the light; 0.4317 is 175.6. 188 is just above half of the light.
+        assert_eq!((doubled[0], doubled[128], doubled[188], doubled[255]), (0, 176, 255, 255));
         let capture = capture(20);
         let stepped = exposure_step(&capture, 2.0);
         assert_eq!(stepped[1].rgba_srgb[1], exposed(0.5)[128]);
-        assert_eq!(stepped[19].rgba_srgb[1], 175);
+        assert_eq!(stepped[19].rgba_srgb[1], 176);
         assert_eq!(&stepped[19].rgba_srgb[3..5], &[255, exposed(2.0)[10]], "alpha stays");
         assert_eq!(stepped[19].rgba_srgb[7], 0, "alpha stays");
     }

@@ -238,7 +238,7 @@ fn color_of(line_ix: usize) -> Color {
 }
 
 fn draw_band(line: &Line, color: Color, plot: &Plot, shapes: &mut Vec<Shape>) {
-    if line.points.iter().all(|point| point.low == point.high) {
+    if line.points.len() < 2 || line.points.iter().all(|point| point.low == point.high) {
         return;
     }
     let above = line.points.iter().map(|point| [plot.x(point.x), plot.y(point.high)]);

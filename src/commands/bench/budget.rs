@@ -61,6 +61,7 @@ struct Capped {
 /// What more splats gained between two caps.
 #[derive(Debug, Serialize)]
 struct Gain {
+    to_cap: Option<u32>,
     from_primitives: f64,
     to_primitives: f64,
     db_per_doubling: f64,
@@ -123,13 +124,13 @@ impl Capped {
     }
 }
 
-/// What doubling gained between neighbouring caps, where the number of splats grew.
+/// What doubling gained between neighboring caps, where the number of splats grew.
 fn gains(by_cap: &[&Capped]) -> Vec<Gain> {
     let pairs = by_cap.windows(2);
     let gain = |pair: &[&Capped]| {
         let [fewer, more] = [pair[0], pair[1]].map(|capped| (capped.primitives, capped.psnr));
         let db_per_doubling = db_per_doubling(fewer, more)?;
-        Some(Gain { from_primitives: fewer.0, to_primitives: more.0, db_per_doubling })
+        Some(Gain { to_cap: pair[1].cap, from_primitives: fewer.0, to_primitives: more.0, db_per_doubling })
     };
     pairs.filter_map(gain).collect()
 }
@@ -174,7 +175,7 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -
     };
     let worth = Chart {
         title: "What doubling the splats gains".into(),
-        subtitle: format!("{subtitle}; each point between two neighbouring caps"),
+        subtitle: format!("{subtitle}; each point between two neighboring caps"),
         x: x("splats (log)"),
         y: Axis { label: "gain, dB a doubling".into(), scale: Scale::Linear, ticks: Vec::new() },
         lines: vec![line("gain of a doubling", gains.iter().map(gain_point).collect())],
@@ -182,7 +183,7 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -
         rules: Vec::new(),
     };
     let row = |capped: &Capped| {
-        let gain = gains.iter().find(|gain| capped.cap.is_some() && gain.to_primitives == capped.primitives);
+        let gain = gains.iter().find(|gain| capped.cap.is_some() && gain.to_cap == capped.cap);
         vec![
             capped.cap_in_words(),
             format!("{:.0}", capped.primitives),
@@ -231,7 +232,7 @@ mod tests {
         };
         let all = [capped(1000, 1000, 20.0), capped(4000, 4000, 23.0), capped(8000, 4100, 23.1)];
         let gains = gains(&all.iter().collect::<Vec<_>>());
-        assert_eq!(gains.len(), 1, "{gains:?}");
+        assert_eq!((gains.len(), gains[0].to_cap), (1, Some(4000)), "{gains:?}");
         assert!((gains[0].db_per_doubling - 1.5).abs() < 1e-12);
     }
 }

@@ -5,7 +5,7 @@ use crate::bench::peer::Peer;
 use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
 use crate::bench::statistics::{extent, median, sample_std, secs_to};
 use crate::chart::{Axis, Chart, Line, Point, Scale, short};
-use crate::exit::{self, Exit};
+use crate::exit::{self, BadArgument, Exit};
 use crate::{marks, training};
 use serde::Serialize;
 use std::collections::{BTreeMap, HashSet};
@@ -84,6 +84,9 @@ struct Reached {
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let limits = training::limits(Some(args.seconds), None, USUAL_SECONDS)?;
+    if args.seconds == 0.0 {
+        return Err(BadArgument("--seconds: must be above 0".into()).into());
+    }
     let peers = args.peer.iter().map(|path| Peer::load(path)).collect::<Result<Vec<_>, _>>()?;
     let mut runs = Runs::open(&args.bench, crate::commands::open_gpu()?)?;
     runs.expect(args.data.len() * usize::try_from(args.seeds)?);

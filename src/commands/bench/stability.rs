@@ -30,7 +30,7 @@ struct Variant {
     change: fn(SplatOptions) -> SplatOptions,
 }
 
-const VARIANTS: &[Variant] = &[Variant { name: "as it is", change: |options| options }];
+const VARIANTS: &[Variant] = &[Variant { name: "plain", change: |options| options }];
 
 /// Flags of `bench stability`.
 #[derive(Debug, clap::Args)]
@@ -291,16 +291,17 @@ impl Curve {
         self.breaks = BREAKS_DB.map(break_at).into();
     }
 
-    fn line(&self) -> Line {
+    fn line(&self, label: &str) -> Line {
         let point = |at: &Level| Point { x: at.level, y: at.psnr, low: at.psnr_extent[0], high: at.psnr_extent[1] };
         let mut points: Vec<Point> = self.points.iter().map(point).collect();
         points.sort_by(|a, b| a.x.total_cmp(&b.x));
-        Line { label: self.name.to_owned(), points, is_foreign: false }
+        Line { label: label.to_owned(), points, is_foreign: false }
     }
 }
 
 impl Envelope {
-    fn chart(&self, subtitle: &str) -> Chart {
+    /// `of_one` names the line where there is only one variant.
+    fn chart(&self, subtitle: &str, of_one: &str) -> Chart {
         let levels = || {
             let mut levels: Vec<f64> =
                 self.variants.iter().flat_map(|curve| &curve.points).map(|point| point.level).collect();
@@ -320,12 +321,13 @@ impl Envelope {
             Some(Rule { x: level, label, line_ix })
         };
         let curves = self.variants.iter().enumerate();
+        let label = |curve: &Curve| if self.variants.len() > 1 { curve.name } else { of_one };
         Chart {
             title: format!("PSNR of held-out images under {}", in_words(self.what)),
             subtitle: subtitle.to_owned(),
             x: Axis { label: self.what.axis().to_owned(), scale, ticks },
             y: Axis { label: "test PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() },
-            lines: self.variants.iter().map(Curve::line).collect(),
+            lines: self.variants.iter().map(|curve| curve.line(label(curve))).collect(),
             floors: Vec::new(),
             rules: curves.flat_map(|(ix, curve)| curve.breaks.iter().filter_map(move |at| rule(ix, at))).collect(),
         }
@@ -378,14 +380,15 @@ fn findings(
     } else {
         "one run a size".to_owned()
     };
-    let subtitle = format!("{}, {}, {length}; {spread}", data.name, data.kind.name());
+    let subtitle = format!("after {length}; {spread}");
+    let label = format!("{}, {}", data.name, data.kind.name());
     let part = |what: Disturbance| match what {
         Disturbance::PoseNoise => "-pose-noise",
         Disturbance::ClockOffset => "-clock-offset",
         Disturbance::Exposure => "-exposure",
         Disturbance::Keyframes => "-keyframes",
     };
-    let charts = envelopes.iter().map(|envelope| (part(envelope.what), envelope.chart(&subtitle)));
+    let charts = envelopes.iter().map(|envelope| (part(envelope.what), envelope.chart(&subtitle, &label)));
     let head = ["disturbance", "trainer", "undisturbed, dB", "-1 dB at", "-3 dB at"].map(str::to_owned).to_vec();
     let level_rows = envelopes.iter().flat_map(|envelope| {
         envelope.variants.iter().flat_map(|curve| {
@@ -408,7 +411,7 @@ fn findings(
             format!(
                 "Each point is a model trained for {length} on disturbed images and scored on held-out images that are not                  disturbed. A break point is where the line has fallen by 1 or 3 dB from its undisturbed end."
             ),
-            "Pose noise turns each camera too, by 0.1 degrees a millimetre; poses of a clock offset are interpolated between              neighbouring images; an exposure step darkens the first half of the capture and brightens the second, half each."
+            "Pose noise turns each camera too, by 0.1 degrees a millimetre; poses of a clock offset are interpolated between              neighboring images; an exposure step darkens the first half of the capture and brightens the second, half each."
                 .into(),
             format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),
         ],
@@ -447,13 +450,13 @@ mod tests {
 
     #[test]
     fn break_points_follow_the_points() {
-        let mut curve = Curve { name: "as it is", points: Vec::new(), breaks: Vec::new() };
+        let mut curve = Curve { name: "plain", points: Vec::new(), breaks: Vec::new() };
         for (level, psnr) in [(100.0, 30.0), (25.0, 28.0), (5.0, 20.0)] {
             curve.add(Disturbance::Keyframes, level, vec![run("a", &[(1.0, psnr)], 10)]);
         }
         let [first, second] = &curve.breaks[..] else { panic!("two breaks") };
         assert!(first.level.is_some_and(|level| (level - 50.0).abs() < 1e-9), "{first:?}");
         assert!(second.level.is_some_and(|level| (5.0..25.0).contains(&level)), "{second:?}");
-        assert_eq!(curve.line().points[0].x, 5.0, "lines run from left to right");
+        assert_eq!(curve.line("plain").points[0].x, 5.0, "lines run from left to right");
     }
 }
