@@ -16,6 +16,7 @@ fn scene(folder: &Path) {
         let x_m = 0.05 * f64::from(ix);
         let color = |u: u32, v: u32| {
             let (x, y) = (x_m + (f64::from(u) - 15.5) / focal_px, (f64::from(v) - 11.5) / focal_px);
+            #[expect(clippy::cast_possible_truncation, reason = "27 to 227")]
             let wave = |phase: f64| (127.0 + 100.0 * (8.0 * x + phase).sin() * (7.0 * y + phase).cos()) as u8;
             image::Rgb([wave(0.0), wave(1.0), wave(2.0)])
         };

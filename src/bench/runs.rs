@@ -237,12 +237,7 @@ impl<'a> Runs<'a> {
         };
         let session = training::train(self.gpu.clone(), plan, &(job.keyframes)(), &self.stop)?;
         if self.stop.asked() && !session.is_over() {
-            bail!(
-                "stopped in run {} of {}: the same command with --out {} goes on from there",
-                self.n_done,
-                self.n_all,
-                self.out.display()
-            );
+            bail!("stopped before its end: the same command with --out {} goes on from there", self.out.display());
         }
         session.conclude()
     }
