@@ -42,7 +42,7 @@ pub(crate) enum Command {
     Export(export::Args),
     /// Compute where a robot's tip is for given joint values
     Fk(fk::Args),
-    /// Measure how fast the kernels are
+    /// Measure speed, accuracy over time and size, and what disturbances cost; draws charts
     Bench(bench::Args),
     /// List what is plugged in and what of it can be used
     Devices(devices::Args),

@@ -37,6 +37,8 @@ pub(crate) struct Data {
     pub(crate) names: Vec<String>,
     /// The rig that recorded them; a folder has none.
     pub(crate) rig: Option<Rig>,
+    /// Whether the stamps are times; else they only count the images.
+    pub(crate) has_times: bool,
     /// What was lost on the way; anything here makes the exit code 3.
     pub(crate) losses: Vec<String>,
 }
@@ -101,7 +103,13 @@ impl Data {
         for note in &loaded.notes {
             log::warn!("{note}");
         }
-        let mut data = Self { keyframes: loaded.keyframes, names: loaded.names, rig: None, losses: loaded.losses };
+        let mut data = Self {
+            keyframes: loaded.keyframes,
+            names: loaded.names,
+            rig: None,
+            has_times: folder.has_times(),
+            losses: loaded.losses,
+        };
         if let Some(list) = list {
             data.take_only(&list)?;
         }
@@ -143,7 +151,7 @@ impl Data {
         losses.extend(damage.get().cloned());
         losses.extend(join.check_list()?);
         let names = keyframes.iter().map(|keyframe| name(keyframe)).collect();
-        Ok(Self { keyframes, names, rig: Some(rig), losses })
+        Ok(Self { keyframes, names, rig: Some(rig), has_times: true, losses })
     }
 
     /// Splits anew, each camera on its own.

@@ -1,6 +1,8 @@
 //! The `fieldrig` command: parse, run, exit code.
 
+mod bench;
 mod camera_path;
+mod chart;
 mod checkpoints;
 mod cli;
 mod commands;
@@ -24,6 +26,7 @@ mod session;
 mod shrink;
 mod splat_file;
 mod stop;
+mod training;
 mod training_args;
 
 use clap::Parser;

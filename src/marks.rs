@@ -24,6 +24,18 @@ impl Marks {
     }
 }
 
+/// The newest mark at `secs`; `None` before the first.
+pub(crate) fn latest(secs: f64) -> Option<f64> {
+    up_to(secs).last()
+}
+
+/// The marks up to `secs`.
+pub(crate) fn up_to(secs: f64) -> impl Iterator<Item = f64> {
+    let first = Marks::default().next_secs;
+    std::iter::successors(Some(first), |mark_secs| Some(after(*mark_secs)))
+        .take_while(move |mark_secs| *mark_secs <= secs)
+}
+
 /// Doubles, and turns from seconds to whole minutes between 32 s and 60 s.
 fn after(mark_secs: f64) -> f64 {
     if mark_secs == 32.0 { 60.0 } else { 2.0 * mark_secs }
@@ -38,6 +50,12 @@ mod tests {
         let mut marks = Marks::default();
         let reached: Vec<f64> = (0..=4000).map(|n| f64::from(n) * 0.125).filter(|secs| marks.reached(*secs)).collect();
         assert_eq!(reached, [0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 120.0, 240.0, 480.0]);
+    }
+
+    #[test]
+    fn the_newest_mark_is_the_one_reached() {
+        assert_eq!([0.2, 0.25, 0.3, 59.0, 61.0].map(latest), [None, Some(0.25), Some(0.25), Some(32.0), Some(60.0)]);
+        assert_eq!(up_to(4.5).collect::<Vec<_>>(), [0.25, 0.5, 1.0, 2.0, 4.0]);
     }
 
     #[test]

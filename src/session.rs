@@ -35,6 +35,26 @@ pub(crate) struct Evaluators {
     pub(crate) at_end: Evaluator,
 }
 
+/// What a session prints.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Tell {
+    /// A line a mark, and a bar where stderr is a terminal.
+    Lines,
+    /// One JSON object a mark.
+    Json,
+    /// Nothing but the bar: the caller tells what came of it.
+    Bar,
+    /// Nothing at all.
+    Nothing,
+}
+
+impl Tell {
+    /// What a command prints of its one session.
+    pub(crate) fn of_command(json: bool) -> Self {
+        if json { Self::Json } else { Self::Lines }
+    }
+}
+
 /// A model in training.
 pub(crate) struct Session {
     pub(crate) method: Box<dyn Method>,
@@ -53,7 +73,7 @@ pub(crate) struct Session {
     history: Vec<(f64, f64)>,
     /// Newest PSNR of each test keyframe, by camera and stamp.
     newest_psnr: BTreeMap<(String, i64), f64>,
-    json: bool,
+    tell: Tell,
     bar: ProgressBar,
 }
 
@@ -75,17 +95,29 @@ impl Clock {
 
 /// What is told at a mark.
 #[derive(Clone, Debug, Serialize)]
-struct Eval {
+pub(crate) struct Eval {
     event: &'static str,
-    seconds: f64,
-    step: u64,
+    pub(crate) seconds: f64,
+    pub(crate) step: u64,
     #[serde(flatten)]
-    scores: Scores,
+    pub(crate) scores: Scores,
     /// Test images that the scores are means over.
     n_images: usize,
-    primitives: u64,
-    bytes: u64,
+    pub(crate) primitives: u64,
+    pub(crate) bytes: u64,
     step_millis: Option<f64>,
+}
+
+/// What came of a training.
+pub(crate) struct Outcome {
+    pub(crate) seconds: f64,
+    pub(crate) steps: u64,
+    pub(crate) scores: Scores,
+    pub(crate) primitives: u64,
+    pub(crate) bytes: u64,
+    /// What was told at the marks.
+    pub(crate) marks: Vec<Eval>,
+    per_image: Vec<ImageScores>,
 }
 
 /// What is told at the end.
@@ -120,7 +152,7 @@ impl Session {
         method: Box<dyn Method>,
         evaluators: Evaluators,
         limits: Limits,
-        json: bool,
+        tell: Tell,
     ) -> Self {
         let length = limits.steps.or(limits.seconds.map(whole_secs));
         let template = if length.is_some() { "{bar:30} {elapsed} {msg}" } else { "{spinner} {elapsed} {msg}" };
@@ -138,8 +170,8 @@ impl Session {
             told: Vec::new(),
             history: Vec::new(),
             newest_psnr: BTreeMap::new(),
-            json,
-            bar: print::bar(length, template, json),
+            tell,
+            bar: print::bar(length, template, matches!(tell, Tell::Json | Tell::Nothing)),
         }
     }
 
@@ -158,6 +190,11 @@ impl Session {
     /// Starts the clock, unless it runs.
     pub(crate) fn start_clock(&mut self, at: Instant) {
         self.clock.started.get_or_insert(at);
+    }
+
+    /// When the clock started, once it runs.
+    pub(crate) fn clock_started(&self) -> Option<Instant> {
+        self.clock.started
     }
 
     /// Seconds of training so far.
@@ -232,35 +269,40 @@ impl Session {
     ///
     /// `particulars` are what only this kind of run knows.
     pub(crate) fn finish(mut self, out: &Path, particulars: &impl Serialize) -> anyhow::Result<()> {
-        self.gpu.wait()?;
-        let seconds = self.secs();
-        self.bar.finish_and_clear();
+        let seconds = self.halt()?;
         // Saved before it is scored: a second Ctrl-C during the scoring loses nothing.
         run_folder::save_model(self.method.as_mut(), out)?;
         if let Some(checkpoints) = &mut self.checkpoints {
             checkpoints.begin(self.method.as_mut(), seconds)?;
         }
         let checkpoint_sha256 = run_folder::checkpoint_sha256(out)?;
-        std::mem::swap(&mut self.evaluator, &mut self.last_evaluator);
-        let per_image = self.score(usize::MAX)?;
-        let progress = self.method.progress();
+        let outcome = self.score_at_end(seconds)?;
         let done = Done {
             event: "done",
             seconds,
-            steps: progress.step,
-            scores: Scores::mean(&per_image),
-            primitives: progress.primitives,
-            bytes: progress.bytes,
+            steps: outcome.steps,
+            scores: outcome.scores,
+            primitives: outcome.primitives,
+            bytes: outcome.bytes,
             out,
             checkpoint_sha256: &checkpoint_sha256,
         };
-        let report =
-            Report { done: &done, adapter: self.gpu.describe(), particulars, marks: &self.told, per_image: &per_image };
+        let report = Report {
+            done: &done,
+            adapter: self.gpu.describe(),
+            particulars,
+            marks: &outcome.marks,
+            per_image: &outcome.per_image,
+        };
         run_folder::write_json(&out.join("report.json"), &report)?;
         let last_checkpoint = self.checkpoints.as_mut().map_or(Ok(()), Checkpoints::wait);
-        if self.json {
-            print::json(&done)?;
-            return last_checkpoint;
+        match self.tell {
+            Tell::Json => {
+                print::json(&done)?;
+                return last_checkpoint;
+            }
+            Tell::Bar | Tell::Nothing => return last_checkpoint,
+            Tell::Lines => {}
         }
         print::line(format_args!(
             "{seconds:.1} s, {}, {}, {:.1} MB: {}",
@@ -271,6 +313,35 @@ impl Session {
         ))?;
         print::line(format_args!("saved in {}", out.display()))?;
         last_checkpoint
+    }
+
+    /// Scores the model a last time, and saves nothing.
+    pub(crate) fn conclude(mut self) -> anyhow::Result<Outcome> {
+        let seconds = self.halt()?;
+        self.score_at_end(seconds)
+    }
+
+    /// Waits for what is queued; the seconds of training come back.
+    fn halt(&mut self) -> anyhow::Result<f64> {
+        self.gpu.wait()?;
+        let seconds = self.secs();
+        self.bar.finish_and_clear();
+        Ok(seconds)
+    }
+
+    fn score_at_end(&mut self, seconds: f64) -> anyhow::Result<Outcome> {
+        std::mem::swap(&mut self.evaluator, &mut self.last_evaluator);
+        let per_image = self.score(usize::MAX)?;
+        let progress = self.method.progress();
+        Ok(Outcome {
+            seconds,
+            steps: progress.step,
+            scores: Scores::mean(&per_image),
+            primitives: progress.primitives,
+            bytes: progress.bytes,
+            marks: std::mem::take(&mut self.told),
+            per_image,
+        })
     }
 
     /// Scores at most `most` test keyframes, off the clock.
@@ -305,13 +376,13 @@ impl Session {
             bytes: progress.bytes,
             step_millis: (progress.step > 0).then_some(progress.step_millis),
         };
-        if self.json {
-            print::json(&eval)?;
-        } else {
-            print::line(format_args!(
+        match self.tell {
+            Tell::Json => print::json(&eval)?,
+            Tell::Lines => print::line(format_args!(
                 "{seconds:7.2} s  step {:6}  {:8} splats  {:7.2} ms a step  {}",
                 eval.step, eval.primitives, progress.step_millis, eval.scores
-            ))?;
+            ))?,
+            Tell::Bar | Tell::Nothing => {}
         }
         self.told.push(eval);
         Ok(())

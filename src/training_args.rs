@@ -1,8 +1,10 @@
 //! Flags that every training command has; they override keys of the same name in a rig file.
 
 use crate::config::{MAX_BYTES, MAX_SPLATS, Override, SEED};
+use crate::exit::BadArgument;
 use crate::method::Kind;
 use clap::value_parser;
+use trainer::splat::{CameraChoice, TermSet};
 
 /// What to train, and how large it may become.
 #[derive(Clone, Debug, clap::Args)]
@@ -19,9 +21,51 @@ pub(crate) struct TrainingArgs {
     /// Most splats, 1 to 100000000 [default: the rig file's, else 400000]
     #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(MAX_SPLATS))]
     pub(crate) max_splats: Option<u64>,
+    /// What is learned about cameras along with the scene: auto (what pays on held-back images), none, or a list of mount,
+    /// delay, lens, image-poses and image-gains, separated by commas [default: none; for data on disk auto on a GPU]
+    #[arg(long, value_name = "TERMS", value_delimiter = ',', hide_possible_values = true)]
+    pub(crate) refine: Vec<Refine>,
+}
+
+/// What `--refine` takes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub(crate) enum Refine {
+    Auto,
+    None,
+    Mount,
+    Delay,
+    Lens,
+    ImagePoses,
+    ImageGains,
 }
 
 impl TrainingArgs {
+    /// What is learned about cameras; `usual` where no flag says.
+    ///
+    /// Poses that come from joints are wrong in what all images share, those of a SLAM system drift from image to image.
+    pub(crate) fn cameras(&self, poses_from_joints: bool, usual: Refine) -> Result<CameraChoice, BadArgument> {
+        let asked = if self.refine.is_empty() { std::slice::from_ref(&usual) } else { &self.refine };
+        let has = |term| asked.contains(&term);
+        if (has(Refine::Auto) || has(Refine::None)) && asked.len() > 1 {
+            return Err(BadArgument("--refine: auto and none stand alone".into()));
+        }
+        if has(Refine::Auto) {
+            let first = if poses_from_joints {
+                TermSet { mount: true, delay: true, ..TermSet::default() }
+            } else {
+                TermSet { image_poses: true, ..TermSet::default() }
+            };
+            return Ok(CameraChoice::Try(vec![first]));
+        }
+        Ok(CameraChoice::Given(TermSet {
+            mount: has(Refine::Mount),
+            delay: has(Refine::Delay),
+            lens: has(Refine::Lens),
+            image_poses: has(Refine::ImagePoses),
+            image_gains: has(Refine::ImageGains),
+        }))
+    }
+
     /// The keys of the rig file that the flags stand for.
     pub(crate) fn overrides(&self) -> Vec<Override> {
         let mut overrides = Vec::new();

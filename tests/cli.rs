@@ -129,6 +129,12 @@ fn arguments_that_make_no_sense_exit_with_2() {
     for (flag, value) in [("--splats", "0"), ("--splats", "100000000000"), ("--repeats", "0"), ("--size", "0x9")] {
         assert_refused(&["bench", "kernels", flag, value], 2, &[flag]);
     }
+    assert_refused(&["bench", "curve", "absent", "--seconds", "NaN"], 2, &["--seconds"]);
+    assert_refused(&["bench", "curve", "absent", "--seeds", "0"], 2, &["--seeds"]);
+    assert_refused(&["bench", "curve", "absent", "--peer", "absent.json"], 2, &["absent.json"]);
+    assert_refused(&["bench", "budget", "absent", "--splats", "0"], 2, &["--splats"]);
+    assert_refused(&["bench", "stability", "absent", "--disturb", "weather"], 2, &["weather", "pose-noise"]);
+    assert_refused(&["bench", "stability", "absent", "--rate-hz", "0"], 2, &["--rate-hz"]);
     let folder = tempfile::tempdir().expect("a folder");
     let rig = changed_rig(folder.path(), "seed = 1", "seed = 2");
     assert_refused(&["run", &rig, "--sim", "--steps-per-keyframe", "3"], 2, &["--steps-per-keyframe", "--lockstep"]);

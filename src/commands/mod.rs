@@ -28,7 +28,7 @@ pub(crate) fn run(command: Command) -> anyhow::Result<Exit> {
         Command::Metrics(args) => metrics::run(args).map(|()| Exit::Done),
         Command::Export(args) => export::run(&args),
         Command::Fk(args) => fk::run(args).map(|()| Exit::Done),
-        Command::Bench(args) => bench::run(&args).map(|()| Exit::Done),
+        Command::Bench(args) => bench::run(&args),
         Command::Devices(args) => devices::run(&args),
         Command::Doctor(args) => doctor::run(&args),
     }

@@ -9,9 +9,9 @@ use crate::join::{Counts, Join, Refusal, Use};
 use crate::live::{Live, LiveOptions, Pace};
 use crate::method::{self, Kind};
 use crate::open::{self, Devices, Opened};
-use crate::session::{Evaluators, Limits, Session};
+use crate::session::{Evaluators, Limits, Session, Tell};
 use crate::stop::Stop;
-use crate::training_args::TrainingArgs;
+use crate::training_args::{Refine, TrainingArgs};
 use crate::{print, run_folder};
 use anyhow::Context;
 use drivers::Source;
@@ -21,6 +21,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 use trainer::gpu::Gpu;
+use trainer::splat::SplatOptions;
 use trainer::{Keyframe, Split};
 use viz::{Hub, Server, ServerConfig};
 
@@ -108,14 +109,16 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let feed = Feed::start(args.input(&rig, source)?, hub.clone(), stop.clone())?;
     let gpu = super::open_gpu()?;
     let notes = notes(&gpu);
-    let method = kind.start(gpu.clone(), method::options(&rig.train, args.steps)?)?;
+    let cameras = args.training.cameras(true, Refine::None)?;
+    let options = SplatOptions { cameras, ..method::options(&rig.train, args.steps)? };
+    let method = kind.start(gpu.clone(), options)?;
     let evaluators = Evaluators {
         at_marks: Evaluator::psnr_only(),
         most_at_marks: MOST_SCORED_AT_MARKS,
         at_end: Evaluator::thorough(None)?,
     };
     let limits = Limits { seconds: args.seconds, steps: args.steps };
-    let session = Session::new(gpu, method, evaluators, limits, args.json)
+    let session = Session::new(gpu, method, evaluators, limits, Tell::of_command(args.json))
         .with_checkpoints(Checkpoints::new(&out, args.checkpoints));
     let options = LiveOptions { pace, method_name: kind.name(), start_keyframes: rig.join.start_keyframes, notes };
 

@@ -1,21 +1,23 @@
 //! `fieldrig train`: a model of a dataset folder or a recording.
 
 use crate::checkpoints::{self, CheckpointArgs, Checkpoints};
-use crate::config::USUAL_SEED;
 use crate::data::{Data, DataArgs, Purpose};
 use crate::evaluate::Evaluator;
-use crate::exit::{self, BadArgument, Exit};
-use crate::method::{self, Kind, Resumed, options};
+use crate::exit::{self, Exit};
+use crate::method::{self, Resumed};
 use crate::print;
 use crate::run_folder;
-use crate::session::{Evaluators, Limits, Session};
+use crate::session::{Evaluators, Session, Tell};
 use crate::stop::Stop;
+use crate::training;
 use crate::training_args::TrainingArgs;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use trainer::Split;
-use trainer::splat::{CameraChoice, SplatOptions, TermSet};
+
+/// Length of a training where no flag says.
+const USUAL_SECONDS: f64 = 120.0;
 
 /// Flags of `train`.
 #[derive(Debug, clap::Args)]
@@ -25,7 +27,7 @@ pub(crate) struct Args {
     #[command(flatten)]
     training: TrainingArgs,
     /// Go on from the checkpoint that an earlier run left in this folder, with the same data and its settings
-    #[arg(long, value_name = "FOLDER", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "plan_steps"])]
+    #[arg(long, value_name = "FOLDER", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "plan_steps"])]
     resume: Option<PathBuf>,
     /// Stop after S seconds of training, those before --resume included; loading and scoring do not count [default: 120, unless --steps is given]
     #[arg(long, value_name = "S")]
@@ -33,10 +35,6 @@ pub(crate) struct Args {
     /// Stop after N optimiser steps, those before --resume included; no decision reads the clock then
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
-    /// What is learned about cameras along with the scene: auto (what pays on held-back images), none, or a list of mount,
-    /// delay, lens, image-poses and image-gains, separated by commas [default: auto on a GPU, none on a processor]
-    #[arg(long, value_name = "TERMS", value_delimiter = ',', hide_possible_values = true)]
-    refine: Vec<Refine>,
     /// Steps over which learning slows down and the model grows [default: --steps, else 7000]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     plan_steps: Option<u64>,
@@ -71,7 +69,7 @@ struct Particulars<'a> {
 /// Loads, trains until a limit or Ctrl-C, scores at the marks, saves.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let started = Instant::now();
-    let limits = args.limits()?;
+    let limits = training::limits(args.seconds, args.steps, USUAL_SECONDS)?;
     if let Some(out) = &args.out {
         run_folder::refuse_model(out)?;
     }
@@ -84,7 +82,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let Resumed { kind, mut method, options, rest } = match &checkpoint {
         Some(checkpoint) => args.resumed(method::resume(gpu.clone(), checkpoint, &data.keyframes)?),
         None => {
-            let (kind, options) = args.model(&data, gpu.is_software())?;
+            let (kind, options) =
+                training::model(&args.training, &data, args.plan_steps.or(args.steps), gpu.is_software())?;
             let method = kind.start(gpu.clone(), options.clone())?;
             Resumed { kind, method, options, rest: data.keyframes.clone() }
         }
@@ -96,25 +95,19 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         rig.write_settled(&out)?;
     }
 
-    let mut session = Session::new(gpu, method, evaluators, limits, args.json)
+    let session = Session::new(gpu, method, evaluators, limits, Tell::of_command(args.json))
         .with_checkpoints(Checkpoints::new(&out, args.checkpoints))
         .going_on_after(checkpoint.map_or(0.0, |checkpoint| checkpoint.seconds));
-    let clock_starts = Instant::now();
-    session.start_clock(clock_starts);
-    for keyframe in &rest {
-        session.push(keyframe)?;
-    }
-    while !stop.asked() && !session.is_over() {
-        session.step(u64::MAX)?;
-    }
+    let session = training::drive(session, &rest, &stop)?;
 
+    let startup_secs = session.clock_started().map_or(0.0, |at| (at - started).as_secs_f64());
     session.finish(
         &out,
         &Particulars {
             method: kind.name(),
             data: &args.data,
             seed: options.seed,
-            startup_secs: (clock_starts - started).as_secs_f64(),
+            startup_secs,
             n_train: data.of_split(Split::Train).len(),
             n_selection: data.of_split(Split::Selection).len(),
             n_test: data.of_split(Split::Test).len(),
@@ -124,52 +117,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     Ok(exit::after(&data.losses))
 }
 
-/// What `--refine` takes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-enum Refine {
-    Auto,
-    None,
-    Mount,
-    Delay,
-    Lens,
-    ImagePoses,
-    ImageGains,
-}
-
 impl Args {
-    /// Poses that come from joints are wrong in what all images share, those of a SLAM system drift from image to image.
-    fn cameras(&self, data: &Data, software: bool) -> Result<CameraChoice, BadArgument> {
-        let has = |term| self.refine.contains(&term);
-        if (has(Refine::Auto) || has(Refine::None)) && self.refine.len() > 1 {
-            return Err(BadArgument("--refine: auto and none stand alone".into()));
-        }
-        Ok(if has(Refine::Auto) || (self.refine.is_empty() && !software) {
-            let first = if data.rig.is_some() {
-                TermSet { mount: true, delay: true, ..TermSet::default() }
-            } else {
-                TermSet { image_poses: true, ..TermSet::default() }
-            };
-            CameraChoice::Try(vec![first])
-        } else {
-            CameraChoice::Given(TermSet {
-                mount: has(Refine::Mount),
-                delay: has(Refine::Delay),
-                lens: has(Refine::Lens),
-                image_poses: has(Refine::ImagePoses),
-                image_gains: has(Refine::ImageGains),
-            })
-        })
-    }
-
-    fn limits(&self) -> Result<Limits, BadArgument> {
-        const USUAL_SECONDS: f64 = 120.0;
-        if self.seconds.is_some_and(|seconds| seconds.is_nan() || seconds < 0.0) {
-            return Err(BadArgument("--seconds: must be a number of at least 0".into()));
-        }
-        let seconds = self.seconds.or(self.steps.is_none().then_some(USUAL_SECONDS));
-        Ok(Limits { seconds, steps: self.steps })
-    }
-
     /// The folder asked for; a run that was cut off goes on in its own.
     fn out(&self) -> Option<&Path> {
         let unfinished = || self.resume.as_deref().filter(|folder| run_folder::refuse_model(folder).is_ok());
@@ -188,24 +136,5 @@ impl Args {
             log::warn!("{} that the checkpoint does not know", print::counted(n_new as u64, "new image"));
         }
         resumed
-    }
-
-    /// The scene model: the recording's rig file says which, with the flags over it; a folder has the flags only.
-    fn model(&self, data: &Data, software: bool) -> Result<(Kind, SplatOptions), BadArgument> {
-        if let Some(rig) = &data.rig {
-            let plan = self.plan_steps.or(self.steps);
-            let options = SplatOptions { cameras: self.cameras(data, software)?, ..options(&rig.train, plan)? };
-            return Ok((Kind::of_rig(rig)?, options));
-        }
-        let usual = SplatOptions::default();
-        let options = SplatOptions {
-            seed: self.training.seed.unwrap_or(USUAL_SEED),
-            max_splats: self.training.max_splats.map_or(usual.max_splats, |n| n.try_into().unwrap_or(u32::MAX)),
-            max_bytes: self.training.max_bytes,
-            cameras: self.cameras(data, software)?,
-            n_planned_steps: self.plan_steps.or(self.steps).unwrap_or(usual.n_planned_steps),
-            ..usual
-        };
-        Ok((self.training.method.unwrap_or(Kind::Splat), options))
     }
 }

@@ -26,9 +26,20 @@ pub struct Dataset {
     pub losses: Vec<String>,
 }
 
+impl Dataset {
+    /// Whether the stamps of its frames are times; else they only count the frames.
+    pub fn has_times(&self) -> bool {
+        !is_nerfstudio(&self.path) && self.path.join(tum::COLOR_LIST).is_file()
+    }
+}
+
+fn is_nerfstudio(path: &Path) -> bool {
+    path.is_file() || path.join(nerfstudio::FILE_NAME).is_file()
+}
+
 /// Reads a dataset folder of either kind; `path` may also name a `transforms.json`.
 pub fn read(path: &Path) -> Result<Dataset, Error> {
-    if path.is_file() || path.join(nerfstudio::FILE_NAME).is_file() {
+    if is_nerfstudio(path) {
         return nerfstudio::read(path);
     }
     if path.join(tum::COLOR_LIST).is_file() {

@@ -1,7 +1,6 @@
-//! `fieldrig bench`: how fast the kernels are.
+//! `fieldrig bench kernels`: how fast the kernels are.
 
 use anyhow::Context;
-use clap::{Parser, Subcommand};
 use serde::Serialize;
 use std::io::Write;
 use std::path::PathBuf;
@@ -29,21 +28,9 @@ const USUAL: Usual = Usual {
 /// On the CPU, which takes seconds a step for what a GPU does in a millisecond, and binds smaller buffers.
 const USUAL_ON_CPU: Usual = Usual { size: &[Size([320, 240])], splats: &[10_000, 30_000], repeats: 3 };
 
-/// What to measure.
-#[derive(Debug, Parser)]
+/// Flags of `bench kernels`.
+#[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    #[command(subcommand)]
-    what: What,
-}
-
-#[derive(Debug, Subcommand)]
-enum What {
-    /// Time of a picture and of a training step on a synthetic cloud of splats, by size and count
-    Kernels(KernelArgs),
-}
-
-#[derive(Debug, Parser)]
-struct KernelArgs {
     /// Take the cloud from a file of arrays `means`, `quats`, `log_scales`, `opacities_logit` and `sh`, in place of our own
     #[arg(long, value_name = "FILE.npz")]
     cloud: Option<PathBuf>,
@@ -92,13 +79,12 @@ struct Row {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
-    let What::Kernels(args) = &args.what;
     let given = args
         .cloud
         .as_deref()
         .map(|path| load_cloud_npz(path).with_context(|| format!("cloud {path:?}")))
         .transpose()?;
-    let usual = if super::open_gpu()?.is_software() { USUAL_ON_CPU } else { USUAL };
+    let usual = if crate::commands::open_gpu()?.is_software() { USUAL_ON_CPU } else { USUAL };
     let sizes = if args.size.is_empty() { usual.size } else { &args.size };
     let asked = if args.splats.is_empty() { usual.splats } else { &args.splats };
     let counts = given
@@ -109,7 +95,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     for (place, Size(size)) in sizes.iter().enumerate() {
         for n_splats in &counts {
             // A fresh device for each row, so that the peak of memory is the row's own.
-            let gpu = super::open_gpu()?;
+            let gpu = crate::commands::open_gpu()?;
             if place == 0 && counts.first() == Some(n_splats) {
                 log::info!("{}", gpu.describe());
             }

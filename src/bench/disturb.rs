@@ -1,0 +1,401 @@
+//! Disturbances of training keyframes, one size at a time; test keyframes stay as they are.
+//!
+//! A disturbance is a function of its size, a seed, and the keyframes: it has no state, and what befalls a keyframe depends
+//! on no other one's order. Sizes of one seed share their random directions, so that a curve over sizes has no noise of its own.
+
+use crate::bench::statistics::Between;
+use kinematics::{Stamp, Transform, Twist, transform};
+use nalgebra::{UnitQuaternion, Vector3};
+use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use trainer::{Keyframe, Split};
+
+/// What is disturbed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Disturbance {
+    /// Every camera is a little elsewhere than its pose says.
+    PoseNoise,
+    /// Poses belong to another time than images.
+    ClockOffset,
+    /// The light changes in the middle of the capture.
+    Exposure,
+    /// There are few keyframes.
+    Keyframes,
+}
+
+/// Turn that comes with a shift of pose noise, degrees per millimetre: 5 degrees at 50 mm.
+const DEGREES_PER_MM: f64 = 0.1;
+
+impl Disturbance {
+    /// All there are.
+    pub(crate) const ALL: [Self; 4] = [Self::PoseNoise, Self::ClockOffset, Self::Exposure, Self::Keyframes];
+
+    /// Its name in files and on the command line.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::PoseNoise => "pose-noise",
+            Self::ClockOffset => "clock-offset",
+            Self::Exposure => "exposure",
+            Self::Keyframes => "keyframes",
+        }
+    }
+
+    /// What its size means, with the unit, for an axis.
+    pub(crate) fn axis(self) -> &'static str {
+        match self {
+            Self::PoseNoise => "pose noise, mm (standard deviation along each axis; 0.1 degrees of turn per mm)",
+            Self::ClockOffset => "clock offset of the poses, ms",
+            Self::Exposure => "exposure step in the middle of the capture, EV",
+            Self::Keyframes => "training keyframes",
+        }
+    }
+
+    /// Unit of its size.
+    pub(crate) fn unit(self) -> &'static str {
+        match self {
+            Self::PoseNoise => "mm",
+            Self::ClockOffset => "ms",
+            Self::Exposure => "EV",
+            Self::Keyframes => "keyframes",
+        }
+    }
+
+    /// Sizes that are measured, from none to large; of keyframes, from few to many.
+    pub(crate) fn usual_levels(self) -> &'static [f64] {
+        match self {
+            Self::PoseNoise => &[0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0],
+            Self::ClockOffset => &[0.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0],
+            Self::Exposure => &[0.0, 0.1, 0.25, 0.5, 0.75, 1.0],
+            Self::Keyframes => &[3.0, 5.0, 10.0, 20.0, 50.0, 100.0, 300.0],
+        }
+    }
+
+    /// How break points between two sizes are found.
+    pub(crate) fn between(self) -> Between {
+        match self {
+            Self::Keyframes => Between::Log,
+            Self::PoseNoise | Self::ClockOffset | Self::Exposure => Between::Linear,
+        }
+    }
+
+    /// The keyframes with the training ones disturbed.
+    ///
+    /// * `level`: size in [`Self::unit`].
+    /// * `nanos_per_sec`: what a second is on the keyframes' stamps; 1e9 unless they only count images.
+    pub(crate) fn apply(
+        self,
+        keyframes: &[Arc<Keyframe>],
+        level: f64,
+        seed: u64,
+        nanos_per_sec: f64,
+    ) -> Vec<Arc<Keyframe>> {
+        match self {
+            Self::PoseNoise => pose_noise(keyframes, level, seed),
+            Self::ClockOffset => clock_offset(keyframes, level * 1e-3 * nanos_per_sec),
+            Self::Exposure => exposure_step(keyframes, level),
+            Self::Keyframes => fewer(keyframes, level),
+        }
+    }
+}
+
+/// Changes every keyframe that is not a test one.
+fn map_training(keyframes: &[Arc<Keyframe>], mut change: impl FnMut(&mut Keyframe)) -> Vec<Arc<Keyframe>> {
+    let change_one = |keyframe: &Arc<Keyframe>| {
+        if keyframe.split == Split::Test {
+            return keyframe.clone();
+        }
+        let mut changed = keyframe.as_ref().clone();
+        change(&mut changed);
+        Arc::new(changed)
+    };
+    keyframes.iter().map(change_one).collect()
+}
+
+/// Moves a camera; its depth sensor moves along.
+fn move_to(keyframe: &mut Keyframe, world_from_camera: Transform) {
+    let moved_from_before = world_from_camera * keyframe.world_from_camera.inverse();
+    if let Some(depth) = &mut keyframe.depth {
+        depth.world_from_camera = moved_from_before * depth.world_from_camera;
+    }
+    keyframe.world_from_camera = world_from_camera;
+}
+
+fn pose_noise(keyframes: &[Arc<Keyframe>], sigma_mm: f64, seed: u64) -> Vec<Arc<Keyframe>> {
+    let sigma_m = 1e-3 * sigma_mm;
+    let sigma_rad = (DEGREES_PER_MM * sigma_mm).to_radians();
+    map_training(keyframes, |keyframe| {
+        let [x, y, z, turn_x, turn_y, turn_z] = six_normals(seed, &keyframe.camera, keyframe.stamp);
+        let camera_from_disturbed = Transform::from_parts(
+            (Vector3::new(x, y, z) * sigma_m).into(),
+            UnitQuaternion::from_scaled_axis(Vector3::new(turn_x, turn_y, turn_z) * sigma_rad),
+        );
+        move_to(keyframe, keyframe.world_from_camera * camera_from_disturbed);
+    })
+}
+
+/// Six independent numbers of mean 0 and standard deviation 1, always the same for a keyframe and a seed.
+///
+/// Source: Box and Muller 1958, on uniform numbers cut from a hash.
+fn six_normals(seed: u64, camera: &str, stamp: Stamp) -> [f64; 6] {
+    let block = |ix: u8| {
+        let mut hash = Sha256::new();
+        hash.update(seed.to_le_bytes());
+        hash.update(stamp.0.to_le_bytes());
+        hash.update([ix]);
+        hash.update(camera.as_bytes());
+        hash.finalize()
+    };
+    // 53 bits fill a f64's fraction; half a unit up keeps the logarithm away from 0.
+    let uniform = |bytes: &[u8]| {
+        let bits = u64::from_le_bytes(bytes.try_into().expect("eight bytes")) >> 11;
+        (bits as f64 + 0.5) / (1_u64 << 53) as f64
+    };
+    let mut normals = [0.0; 6];
+    for (ix, pair) in (0_u8..).zip(normals.chunks_exact_mut(2)) {
+        let bytes = block(ix);
+        let radius = (-2.0 * uniform(&bytes[..8]).ln()).sqrt();
+        let (sine, cosine) = (std::f64::consts::TAU * uniform(&bytes[8..16])).sin_cos();
+        pair.copy_from_slice(&[radius * cosine, radius * sine]);
+    }
+    normals
+}
+
+/// What a camera did over time, as its keyframes tell.
+type Trajectory = Vec<(Stamp, Transform, Option<Twist>)>;
+
+/// Gives each training keyframe the pose, and the velocity, that its camera had `offset_nanos` later.
+fn clock_offset(keyframes: &[Arc<Keyframe>], offset_nanos: f64) -> Vec<Arc<Keyframe>> {
+    let mut trajectories: BTreeMap<Arc<str>, Trajectory> = BTreeMap::new();
+    for keyframe in keyframes {
+        let state = (keyframe.stamp, keyframe.world_from_camera, keyframe.twist);
+        trajectories.entry(keyframe.camera.clone()).or_default().push(state);
+    }
+    for trajectory in trajectories.values_mut() {
+        trajectory.sort_by_key(|(stamp, ..)| *stamp);
+        trajectory.dedup_by_key(|(stamp, ..)| *stamp);
+    }
+    map_training(keyframes, |keyframe| {
+        let nanos = keyframe.stamp.0 as f64 + offset_nanos;
+        if let Some((pose, twist)) = at(&trajectories[&keyframe.camera], nanos) {
+            move_to(keyframe, pose);
+            keyframe.twist = twist.or(keyframe.twist);
+        }
+    })
+}
+
+/// Pose and velocity at a time, between the two neighboring states; past the ends the nearest motion goes on.
+fn at(trajectory: &Trajectory, nanos: f64) -> Option<(Transform, Option<Twist>)> {
+    let next = trajectory.partition_point(|(stamp, ..)| (stamp.0 as f64) < nanos);
+    let next = next.clamp(1, trajectory.len().checked_sub(1).filter(|last| *last > 0)?);
+    let [(stamp_a, a, twist_a), (stamp_b, b, twist_b)] = [&trajectory[next - 1], &trajectory[next]];
+    let frac = (nanos - stamp_a.0 as f64) / stamp_b.nanos_since(*stamp_a) as f64;
+    let twist = twist_a.zip(*twist_b).map(|(a, b)| Twist {
+        linear_m_s: a.linear_m_s.lerp(&b.linear_m_s, frac),
+        angular_rad_s: a.angular_rad_s.lerp(&b.angular_rad_s, frac),
+    });
+    Some((transform::interpolate(a, b, frac), twist))
+}
+
+/// Darkens the first half of the capture and brightens the second, half of `step_ev` each, so that the mean stays.
+fn exposure_step(keyframes: &[Arc<Keyframe>], step_ev: f64) -> Vec<Arc<Keyframe>> {
+    let mut stamps: Vec<Stamp> =
+        keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).map(|keyframe| keyframe.stamp).collect();
+    stamps.sort();
+    let Some(middle) = stamps.get(stamps.len() / 2).copied() else { return keyframes.to_vec() };
+    let [darker, brighter] = [-0.5, 0.5].map(|share| exposed(2.0_f64.powf(share * step_ev)));
+    map_training(keyframes, |keyframe| {
+        let table = if keyframe.stamp < middle { &darker } else { &brighter };
+        let pixels = keyframe.rgba_srgb.chunks_exact(4);
+        keyframe.rgba_srgb = pixels
+            .flat_map(|rgba| [table[rgba[0] as usize], table[rgba[1] as usize], table[rgba[2] as usize], rgba[3]])
+            .collect();
+    })
+}
+
+/// What becomes of each sRGB byte when the light is multiplied by `gain`: linear light, clipped, rounded to 8 bits.
+///
+/// Source: IEC 61966-2-1 for both curves.
+fn exposed(gain: f64) -> [u8; 256] {
+    std::array::from_fn(|byte| {
+        let srgb = byte as f64 / 255.0;
+        let linear = if srgb <= 0.04045 { srgb / 12.92 } else { ((srgb + 0.055) / 1.055).powf(2.4) };
+        let linear = (gain * linear).clamp(0.0, 1.0);
+        let srgb = if linear <= 0.0031308 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 };
+        #[expect(clippy::cast_possible_truncation, reason = "clamped to 0 to 1 above")]
+        let byte = (255.0 * srgb).round() as u8;
+        byte
+    })
+}
+
+/// Keeps `n` training keyframes, spread evenly over all; test keyframes stay.
+fn fewer(keyframes: &[Arc<Keyframe>], n: f64) -> Vec<Arc<Keyframe>> {
+    let n_all = keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).count() as f64;
+    let share = (n / n_all).min(1.0);
+    let mut n_seen = 0.0;
+    let mut is_kept = |keyframe: &&Arc<Keyframe>| {
+        if keyframe.split == Split::Test {
+            return true;
+        }
+        // The one in the middle of each of n equal stretches.
+        let before = (n_seen * share + 0.5).floor();
+        n_seen += 1.0;
+        (n_seen * share + 0.5).floor() > before
+    };
+    keyframes.iter().filter(|keyframe| is_kept(keyframe)).cloned().collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CLOSE: f64 = 1e-9; // Rounding of products of poses near 1.
+
+    /// A camera on a line, turning: 0.1 m and 0.02 rad a keyframe, 10 keyframes a second, gray images.
+    fn capture(n: i64) -> Vec<Arc<Keyframe>> {
+        let keyframe = |ix: i64| {
+            let along = ix as f64;
+            Arc::new(Keyframe {
+                camera: "wrist".into(),
+                stamp: Stamp(ix * 100_000_000),
+                size_px: [2, 1],
+                focal_px: [1.0; 2],
+                principal_px: [1.0, 0.5],
+                rgba_srgb: [0, 128, 250, 255, 10, 20, 30, 0].into(),
+                depth: Some(trainer::DepthMap {
+                    size_px: [1, 1],
+                    focal_px: [1.0; 2],
+                    principal_px: [0.5; 2],
+                    depth_m: [1.0].into(),
+                    world_from_camera: Transform::new(
+                        Vector3::new(0.1 * along + 0.02, 0.0, 0.0),
+                        Vector3::new(0.0, 0.0, 0.02 * along),
+                    ),
+                }),
+                world_from_camera: Transform::new(
+                    Vector3::new(0.1 * along, 0.0, 0.0),
+                    Vector3::new(0.0, 0.0, 0.02 * along),
+                ),
+                twist: None,
+                readout_secs: 0.0,
+                split: Split::of(usize::try_from(ix).expect("not negative")),
+                truth: None,
+            })
+        };
+        (0..n).map(keyframe).collect()
+    }
+
+    fn trained(keyframes: &[Arc<Keyframe>]) -> impl Iterator<Item = &Arc<Keyframe>> {
+        keyframes.iter().filter(|keyframe| keyframe.split != Split::Test)
+    }
+
+    #[test]
+    fn test_keyframes_stay_and_size_zero_changes_nothing() {
+        let capture = capture(40);
+        for what in Disturbance::ALL {
+            let changed = what.apply(&capture, 3.0, 1, 1e9);
+            let tests = |keyframes: &[Arc<Keyframe>]| -> Vec<Arc<Keyframe>> {
+                keyframes.iter().filter(|keyframe| keyframe.split == Split::Test).cloned().collect()
+            };
+            for (before, after) in tests(&capture).iter().zip(tests(&changed)) {
+                assert!(Arc::ptr_eq(before, &after), "{what:?} touches a test keyframe");
+            }
+            assert_eq!(tests(&changed).len(), 5, "{what:?}");
+        }
+        for what in [Disturbance::PoseNoise, Disturbance::ClockOffset, Disturbance::Exposure] {
+            for (before, after) in capture.iter().zip(what.apply(&capture, 0.0, 1, 1e9)) {
+                let off = before.world_from_camera.inverse() * after.world_from_camera;
+                assert!(off.translation.vector.norm() + off.rotation.angle() < CLOSE, "{what:?} of size 0 moves");
+                assert_eq!(before.rgba_srgb, after.rgba_srgb, "{what:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn pose_noise_has_the_size_asked_for() {
+        /// Four standard errors of a standard deviation over three axes of 3500 keyframes.
+        const REL: f64 = 0.03;
+        let capture = capture(4000);
+        let noisy = pose_noise(&capture, 20.0, 7);
+        let (mut shifts, mut turns) = (Vec::new(), Vec::new());
+        for (before, after) in trained(&capture).zip(trained(&noisy)) {
+            let off = before.world_from_camera.inverse() * after.world_from_camera;
+            shifts.extend(off.translation.vector.iter().copied());
+            turns.extend(off.rotation.scaled_axis().iter().copied());
+            let [depth_before, depth_after] =
+                [before, after].map(|keyframe| keyframe.depth.as_ref().expect("depth").world_from_camera);
+            let camera_from_depth = |camera: &Transform, depth: &Transform| camera.inverse() * depth;
+            let moved = camera_from_depth(&before.world_from_camera, &depth_before).inverse()
+                * camera_from_depth(&after.world_from_camera, &depth_after);
+            assert!(moved.translation.vector.norm() + moved.rotation.angle() < CLOSE, "depth moves with its camera");
+        }
+        for (values, sigma) in [(shifts, 0.02), (turns, 2.0_f64.to_radians())] {
+            let n = values.len() as f64;
+            let mean = values.iter().sum::<f64>() / n;
+            let std = (values.iter().map(|value| value * value).sum::<f64>() / n).sqrt();
+            assert!(mean.abs() < 4.0 * sigma / n.sqrt(), "mean {mean}");
+            assert!((std / sigma - 1.0).abs() < REL, "standard deviation {std}, not {sigma}");
+        }
+    }
+
+    #[test]
+    fn pose_noise_is_the_same_again_grows_along_a_line_and_follows_the_seed() {
+        let capture = capture(10);
+        let shift = |sigma_mm: f64, seed: u64| {
+            let noisy = pose_noise(&capture, sigma_mm, seed);
+            (capture[1].world_from_camera.inverse() * noisy[1].world_from_camera).translation.vector
+        };
+        assert_eq!(shift(5.0, 1), shift(5.0, 1));
+        assert!((shift(10.0, 1) - 2.0 * shift(5.0, 1)).norm() < CLOSE);
+        assert!((shift(5.0, 2) - shift(5.0, 1)).norm() > 1e-4);
+        let alone = pose_noise(&capture[1..2], 5.0, 1);
+        assert_eq!(alone[0].world_from_camera, pose_noise(&capture, 5.0, 1)[1].world_from_camera);
+    }
+
+    #[test]
+    fn a_clock_offset_takes_the_pose_of_another_time() {
+        let capture = capture(20);
+        // 50 ms are half of the way to the next keyframe, 250 ms go past the end.
+        for (millis, n_keyframes) in [(50.0, 0.5), (200.0, 2.0), (250.0, 2.5), (-50.0, -0.5)] {
+            let moved = Disturbance::ClockOffset.apply(&capture, millis, 1, 1e9);
+            for (before, after) in trained(&capture).zip(trained(&moved)) {
+                let wanted_x = before.world_from_camera.translation.x + 0.1 * n_keyframes;
+                let wanted_turn = before.world_from_camera.rotation.angle() + 0.02 * n_keyframes;
+                assert!((after.world_from_camera.translation.x - wanted_x).abs() < CLOSE, "{millis} ms");
+                assert!((after.world_from_camera.rotation.angle() - wanted_turn).abs() < CLOSE, "{millis} ms");
+            }
+        }
+        // Where stamps count images, a second is what the rate says it is: 100 ms at 1 image a second of 0.1 s stamps.
+        let counted = Disturbance::ClockOffset.apply(&capture, 100.0, 1, 1e8);
+        assert!((counted[1].world_from_camera.translation.x - 0.11).abs() < CLOSE);
+        let alone = clock_offset(&capture[1..2], 1e8);
+        assert_eq!(alone[0].world_from_camera, capture[1].world_from_camera, "one keyframe tells no motion");
+    }
+
+    #[test]
+    fn exposure_is_multiplied_in_linear_light() {
+        assert!(exposed(1.0).iter().enumerate().all(|(byte, after)| byte == *after as usize));
+        let doubled = exposed(2.0);
+        // 128 is 0.2159 of the light; 0.4317 is 175.6. 188 is just above half of the light.
+        assert_eq!((doubled[0], doubled[128], doubled[188], doubled[255]), (0, 176, 255, 255));
+        let capture = capture(20);
+        let stepped = exposure_step(&capture, 2.0);
+        assert_eq!(stepped[1].rgba_srgb[1], exposed(0.5)[128]);
+        assert_eq!(stepped[19].rgba_srgb[1], 176);
+        assert_eq!(&stepped[19].rgba_srgb[3..5], &[255, exposed(2.0)[10]], "alpha stays");
+        assert_eq!(stepped[19].rgba_srgb[7], 0, "alpha stays");
+    }
+
+    #[test]
+    fn fewer_keyframes_are_spread_over_all() {
+        let capture = capture(80);
+        for n in [1, 3, 10, 69, 70] {
+            let kept = fewer(&capture, f64::from(n));
+            let ixs: Vec<i64> = trained(&kept).map(|keyframe| keyframe.stamp.0 / 100_000_000).collect();
+            assert_eq!(ixs.len(), n as usize);
+            let (first, last) = (ixs[0], ixs[ixs.len() - 1]);
+            assert!(first <= 80 / i64::from(n) && last >= 79 - 80 / i64::from(n), "{ixs:?}");
+        }
+        assert_eq!(trained(&fewer(&capture, 300.0)).count(), 70);
+    }
+}

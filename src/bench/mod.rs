@@ -1,0 +1,7 @@
+//! Many trainings under one question: each is kept in a file of its own as soon as it ends, and all are told in charts.
+
+pub(crate) mod disturb;
+pub(crate) mod page;
+pub(crate) mod peer;
+pub(crate) mod runs;
+pub(crate) mod statistics;

@@ -1,0 +1,155 @@
+//! What a bench found, as files: JSON with every number, charts as SVG and PNG, one page that shows all of it.
+
+use crate::chart::drawing::escaped;
+use crate::chart::{Chart, raster};
+use crate::{print, run_folder};
+use anyhow::Context;
+use serde_json::Value;
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+/// What a bench found so far.
+pub(crate) struct Findings {
+    /// Of the files: `curve`, `budget`, `stability`.
+    pub(crate) name: &'static str,
+    pub(crate) title: String,
+    /// What was done, for the page.
+    pub(crate) sentences: Vec<String>,
+    /// Each with what follows the name in its files' names.
+    pub(crate) charts: Vec<(&'static str, Chart)>,
+    pub(crate) tables: Vec<Table>,
+    /// Every number.
+    pub(crate) numbers: Value,
+}
+
+/// A table in words; the first column is the head of its row.
+pub(crate) struct Table {
+    pub(crate) title: String,
+    pub(crate) head: Vec<String>,
+    pub(crate) rows: Vec<Vec<String>>,
+}
+
+impl Findings {
+    /// Writes all files; the page's place comes back.
+    pub(crate) fn write(&self, folder: &Path) -> anyhow::Result<PathBuf> {
+        let place = |ending: &str| folder.join(format!("{}{ending}", self.name));
+        run_folder::write_json(&place(".json"), &self.numbers)?;
+        let mut page = self.page_head();
+        for (part, chart) in &self.charts {
+            let drawing = chart.draw();
+            let svg = drawing.svg();
+            write_file(&place(&format!("{part}.svg")), svg.as_bytes())?;
+            write_file(&place(&format!("{part}.png")), &raster::png(&drawing)?)?;
+            let title = escaped(&chart.title);
+            write!(page, "<figure role=\"img\" aria-label=\"{title}\">\n{svg}</figure>\n")?;
+        }
+        for table in &self.tables {
+            page.push_str(&table.html());
+        }
+        page.push_str("</main></body></html>\n");
+        let page_place = place(".html");
+        write_file(&page_place, page.as_bytes())?;
+        Ok(page_place)
+    }
+
+    /// Prints the tables, or one JSON object.
+    pub(crate) fn tell(&self, page: &Path, json: bool) -> anyhow::Result<()> {
+        if json {
+            return print::json(&serde_json::json!({ "event": "done", "page": page, "findings": self.numbers }));
+        }
+        for table in &self.tables {
+            print::line(table.text())?;
+        }
+        Ok(print::line(format_args!("see {}", page.display()))?)
+    }
+
+    fn page_head(&self) -> String {
+        let title = escaped(&self.title);
+        let mut head = format!(
+            "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>{title}</title>\n{STYLE}</head>\n\
+             <body><main>\n<h1>{title}</h1>\n"
+        );
+        for sentence in &self.sentences {
+            head.push_str(&format!("<p>{}</p>\n", escaped(sentence)));
+        }
+        head
+    }
+}
+
+const STYLE: &str = "<style>\
+body{font:16px/1.45 system-ui,sans-serif;color:#222;background:#fff;margin:0}\
+main{max-width:980px;margin:2rem auto;padding:0 1rem}\
+figure{margin:1.5rem 0;overflow-x:auto}svg{max-width:100%;height:auto}\
+table{border-collapse:collapse;margin:.5rem 0 2rem;font-variant-numeric:tabular-nums;font-size:14px}\
+th,td{padding:.3rem .8rem;border-bottom:1px solid #ddd;text-align:right;white-space:nowrap}\
+th:first-child,td:first-child{text-align:left}h1{font-size:1.5rem}h2{font-size:1.1rem;margin-bottom:0}\
+.wide{overflow-x:auto}</style>\n";
+
+fn write_file(place: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    std::fs::write(place, bytes).with_context(|| format!("cannot write {}", place.display()))
+}
+
+impl Table {
+    fn html(&self) -> String {
+        let row = |cells: &[String], tag: &str| {
+            let cells: String = cells.iter().map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell))).collect();
+            format!("<tr>{cells}</tr>\n")
+        };
+        let rows: String = self.rows.iter().map(|cells| row(cells, "td")).collect();
+        let (title, head) = (escaped(&self.title), row(&self.head, "th"));
+        format!(
+            "<h2>{title}</h2>\n<div class=\"wide\"><table>\n<thead>{head}</thead>\n<tbody>{rows}</tbody></table></div>\n"
+        )
+    }
+
+    /// The table for a terminal, columns in line.
+    fn text(&self) -> String {
+        let all = || std::iter::once(&self.head).chain(&self.rows);
+        let width = |column: usize| {
+            let widths = all().filter_map(|row| row.get(column)).map(|cell| cell.chars().count());
+            widths.max().unwrap_or(0)
+        };
+        let mut text = format!("\n{}\n", self.title);
+        for row in all() {
+            let cells = row.iter().enumerate().map(|(column, cell)| match column {
+                0 => format!("{cell:<0$}", width(column)),
+                _ => format!("{cell:>0$}", width(column)),
+            });
+            text.push_str(&format!("  {}\n", cells.collect::<Vec<_>>().join("  ")));
+        }
+        text.trim_end().to_owned()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn table() -> Table {
+        let words = |words: [&str; 2]| words.map(str::to_owned).to_vec();
+        Table { title: "Sizes".into(), head: words(["data", "dB"]), rows: vec![words(["a<b", "1.25"])] }
+    }
+
+    #[test]
+    fn tables_are_escaped_and_in_line() {
+        assert_eq!(table().text(), "\nSizes\n  data    dB\n  a<b   1.25");
+        assert!(table().html().contains("<tr><td>a&lt;b</td><td>1.25</td></tr>"));
+    }
+
+    #[test]
+    fn every_file_is_written() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let findings = Findings {
+            name: "curve",
+            title: "Curves".into(),
+            sentences: vec!["One & all.".into()],
+            charts: Vec::new(),
+            tables: vec![table()],
+            numbers: serde_json::json!({ "lines": [] }),
+        };
+        let page = findings.write(folder.path()).expect("room on the disk");
+        let text = std::fs::read_to_string(page).expect("a page");
+        assert!(text.contains("<p>One &amp; all.</p>") && text.contains("<h2>Sizes</h2>"), "{text}");
+        assert!(folder.path().join("curve.json").is_file());
+    }
+}

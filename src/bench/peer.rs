@@ -1,0 +1,73 @@
+//! Curves that other trainers measured: JSON with `rows` of `seconds` and `psnr`.
+
+use crate::exit::BadArgument;
+use serde::Deserialize;
+use std::path::Path;
+
+/// Another trainer's curve.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Peer {
+    /// Name of the file.
+    pub(crate) label: String,
+    pub(crate) rows: Vec<Row>,
+}
+
+/// One time of a curve.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+pub(crate) struct Row {
+    pub(crate) seconds: f64,
+    pub(crate) psnr: f64,
+    /// Primitives, where told.
+    pub(crate) n: Option<u64>,
+}
+
+#[derive(Deserialize)]
+struct File {
+    rows: Vec<Row>,
+}
+
+impl Peer {
+    /// Reads a file; one of another form is the caller's mistake.
+    pub(crate) fn load(path: &Path) -> Result<Self, BadArgument> {
+        let wrong = |reason: &str| BadArgument(format!("--peer {}: {reason}", path.display()));
+        let text = std::fs::read_to_string(path).map_err(|error| wrong(&format!("cannot be read ({error})")))?;
+        let file: File = serde_json::from_str(&text)
+            .map_err(|error| wrong(&format!("wants an object with rows of seconds and psnr ({error})")))?;
+        if file.rows.is_empty() || file.rows.iter().any(|row| row.seconds <= 0.0) {
+            return Err(wrong("has no row, or one whose seconds are not above 0"));
+        }
+        let label = path.file_stem().map_or_else(|| "peer".to_owned(), |stem| stem.to_string_lossy().into_owned());
+        let mut rows = file.rows;
+        rows.sort_by(|a, b| a.seconds.total_cmp(&b.seconds));
+        Ok(Self { label, rows })
+    }
+
+    /// `(seconds, dB)`.
+    pub(crate) fn curve(&self) -> Vec<(f64, f64)> {
+        self.rows.iter().map(|row| (row.seconds, row.psnr)).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_curve_is_read_and_other_files_are_told() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let place = folder.path().join("gsplat_fox.json");
+        let write = |text: &str| std::fs::write(&place, text).expect("written");
+        write(
+            r#"{"args": {"seed": 0}, "rows": [{"seconds": 1.0, "step": 9, "psnr": 12.4, "ssim": 0.6, "n": 7}, {"seconds": 0.5, "psnr": 11.0}]}"#,
+        );
+        let peer = Peer::load(&place).expect("a curve");
+        assert_eq!((peer.label.as_str(), peer.rows[1].n), ("gsplat_fox", Some(7)));
+        assert_eq!(peer.curve(), [(0.5, 11.0), (1.0, 12.4)]);
+        for other in ["[]", r#"{"rows": []}"#, r#"{"rows": [{"seconds": 0.0, "psnr": 1.0}]}"#] {
+            write(other);
+            let told = Peer::load(&place).expect_err("no curve").0;
+            assert!(told.contains("gsplat_fox.json"), "{told}");
+        }
+        assert!(Peer::load(Path::new("absent.json")).expect_err("absent").0.contains("cannot be read"));
+    }
+}

@@ -1,0 +1,415 @@
+//! The runs of a bench: trained once, kept in a file each, and not repeated when the bench goes on in the same folder.
+
+use crate::data::{Data, DataArgs, Purpose};
+use crate::evaluate::Evaluator;
+use crate::exit::{BadArgument, LackOfEvidence};
+use crate::method::Kind;
+use crate::session::{Eval, Evaluators, Limits, Outcome, Tell};
+use crate::stop::Stop;
+use crate::training::{self, Plan};
+use crate::training_args::TrainingArgs;
+use crate::{print, run_folder};
+use anyhow::{Context, bail};
+use serde::{Deserialize, Serialize};
+use std::collections::HashSet;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use trainer::gpu::Gpu;
+use trainer::splat::SplatOptions;
+use trainer::{Keyframe, Split};
+
+/// Folder of the runs, inside the bench's.
+const RUNS: &str = "bench-runs";
+
+/// Flags that every bench of trainings has.
+#[derive(Debug, clap::Args)]
+pub(crate) struct BenchArgs {
+    #[command(flatten)]
+    pub(crate) training: TrainingArgs,
+    #[command(flatten)]
+    pub(crate) images: DataArgs,
+    /// Where runs, charts and the page go; in the folder of an earlier bench what is finished is not repeated
+    /// [default: a new folder in runs]
+    #[arg(long, value_name = "FOLDER")]
+    pub(crate) out: Option<PathBuf>,
+    /// Print one JSON object a line: each run as it ends, then the findings
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+/// What makes two runs the same.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Settings {
+    pub(crate) data: PathBuf,
+    pub(crate) method: String,
+    pub(crate) seed: u64,
+    pub(crate) max_splats: u32,
+    pub(crate) max_bytes: Option<u64>,
+    pub(crate) seconds: Option<f64>,
+    pub(crate) steps: Option<u64>,
+    pub(crate) scale: Option<f64>,
+    pub(crate) holdout: Option<String>,
+    pub(crate) keyframes: Option<PathBuf>,
+    /// Images trained on when nothing is disturbed.
+    pub(crate) n_train: usize,
+    pub(crate) n_test: usize,
+    pub(crate) disturbed: Option<Disturbed>,
+    /// What is changed in the trainer.
+    pub(crate) variant: Option<String>,
+    pub(crate) adapter: String,
+    pub(crate) version: String,
+}
+
+/// What was done to the training keyframes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Disturbed {
+    pub(crate) what: String,
+    pub(crate) level: f64,
+    pub(crate) unit: String,
+    /// Images a second where stamps only count images.
+    pub(crate) rate_hz: Option<f64>,
+}
+
+/// Scores and size at one time. What is not known is `None`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Measured {
+    pub(crate) seconds: f64,
+    pub(crate) step: u64,
+    pub(crate) psnr: Option<f64>,
+    pub(crate) ssim: Option<f64>,
+    pub(crate) lpips: Option<f64>,
+    pub(crate) depth_rmse_m: Option<f64>,
+    pub(crate) primitives: u64,
+    pub(crate) bytes: u64,
+}
+
+/// One finished training.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Run {
+    pub(crate) name: String,
+    pub(crate) settings: Settings,
+    pub(crate) marks: Vec<Measured>,
+    pub(crate) end: Measured,
+}
+
+impl Run {
+    /// Test PSNR at the end, dB; a picture without any error, which has none, counts as very good.
+    pub(crate) fn psnr(&self) -> f64 {
+        const WITHOUT_ERROR_DB: f64 = 99.0;
+        self.end.psnr.unwrap_or(WITHOUT_ERROR_DB)
+    }
+
+    /// `(seconds, dB)` at the marks and at the end.
+    pub(crate) fn curve(&self) -> Vec<(f64, f64)> {
+        /// An end this close after a mark is the mark.
+        const SAME: f64 = 1.02;
+        let is_new = self.marks.last().is_none_or(|last| self.end.seconds > SAME * last.seconds);
+        let points = self.marks.iter().chain(is_new.then_some(&self.end));
+        points.filter_map(|point| Some((point.seconds, point.psnr?))).collect()
+    }
+}
+
+/// A data set under its name in charts.
+pub(crate) struct NamedData {
+    pub(crate) name: String,
+    pub(crate) path: PathBuf,
+    pub(crate) data: Data,
+    pub(crate) kind: Kind,
+    /// As the flags and the recording say.
+    pub(crate) options: SplatOptions,
+}
+
+/// One training to do.
+pub(crate) struct Job<'a> {
+    pub(crate) name: String,
+    pub(crate) data: &'a NamedData,
+    pub(crate) options: SplatOptions,
+    pub(crate) limits: Limits,
+    pub(crate) disturbed: Option<Disturbed>,
+    pub(crate) variant: Option<String>,
+    /// The keyframes; asked for only when the run is not there yet.
+    pub(crate) keyframes: &'a dyn Fn() -> Vec<Arc<Keyframe>>,
+    /// Everything is scored at every mark; else PSNR, and everything at the end.
+    pub(crate) is_thorough: bool,
+}
+
+/// Where runs are done and kept.
+pub(crate) struct Runs<'a> {
+    args: &'a BenchArgs,
+    out: PathBuf,
+    gpu: Arc<Gpu>,
+    stop: Stop,
+    n_all: usize,
+    n_done: usize,
+}
+
+impl<'a> Runs<'a> {
+    /// Makes the folder.
+    pub(crate) fn open(args: &'a BenchArgs, gpu: Arc<Gpu>) -> anyhow::Result<Self> {
+        let stop = Stop::on_ctrl_c()?;
+        let out = run_folder::make(args.out.as_deref())?;
+        let runs = out.join(RUNS);
+        std::fs::create_dir_all(&runs).with_context(|| format!("cannot make the folder {}", runs.display()))?;
+        log::info!("{}", gpu.describe());
+        Ok(Self { args, out, gpu, stop, n_all: 0, n_done: 0 })
+    }
+
+    /// The folder of the bench.
+    pub(crate) fn out(&self) -> &Path {
+        &self.out
+    }
+
+    /// The graphics card in words.
+    pub(crate) fn adapter(&self) -> String {
+        self.gpu.describe()
+    }
+
+    /// Says how many runs there will be.
+    pub(crate) fn expect(&mut self, n_all: usize) {
+        self.n_all = n_all;
+    }
+
+    /// Loads data, and finds a name for it that none of `taken` has.
+    pub(crate) fn load(&self, path: &Path, taken: &mut HashSet<String>) -> anyhow::Result<NamedData> {
+        let overrides = self.args.training.overrides();
+        let data = Data::load(path, &self.args.images, Purpose::Training, &overrides, self.args.json)?;
+        if data.of_split(Split::Test).is_empty() {
+            let reason = "no image is held out for testing, so nothing can be scored: see --holdout";
+            return Err(LackOfEvidence(format!("{}: {reason}", path.display())).into());
+        }
+        let (kind, options) = training::model(&self.args.training, &data, None, self.gpu.is_software())?;
+        Ok(NamedData { name: free_name(path, taken), path: path.to_owned(), data, kind, options })
+    }
+
+    /// The run of a job: out of its file, or trained now and written there.
+    pub(crate) fn run(&mut self, job: Job<'_>) -> anyhow::Result<Run> {
+        self.n_done += 1;
+        let settings = self.settings(&job);
+        let place = self.out.join(RUNS).join(format!("{}.json", file_name(&job.name)));
+        if place.exists() {
+            let kept = read(&place)?;
+            if let Some(difference) = difference(&kept.settings, &settings)? {
+                return Err(BadArgument(format!(
+                    "--out {}: the run {} in it differs in {difference}; name another folder",
+                    self.out.display(),
+                    job.name
+                ))
+                .into());
+            }
+            self.tell(&kept, true)?;
+            return Ok(kept);
+        }
+        log::info!("run {} of {}: {}", self.n_done, self.n_all, job.name);
+        let outcome = self.train(&job).with_context(|| format!("run {}", job.name))?;
+        let run = Run {
+            name: job.name,
+            settings,
+            marks: outcome.marks.iter().map(of_mark).collect(),
+            end: Measured {
+                seconds: outcome.seconds,
+                step: outcome.steps,
+                psnr: outcome.scores.psnr,
+                ssim: outcome.scores.ssim,
+                lpips: outcome.scores.lpips,
+                depth_rmse_m: outcome.scores.depth_rmse_m,
+                primitives: outcome.primitives,
+                bytes: outcome.bytes,
+            },
+        };
+        // Beside its place first: a file that is there is whole.
+        let unfinished = place.with_extension("part");
+        run_folder::write_json(&unfinished, &run)?;
+        std::fs::rename(&unfinished, &place).with_context(|| format!("cannot write {}", place.display()))?;
+        self.tell(&run, false)?;
+        Ok(run)
+    }
+
+    fn train(&self, job: &Job<'_>) -> anyhow::Result<Outcome> {
+        let thorough = Evaluator::thorough(None)?;
+        let at_marks = if job.is_thorough { thorough.clone() } else { Evaluator::psnr_only() };
+        let n_planned_steps = job.limits.steps.unwrap_or(job.options.n_planned_steps);
+        let plan = Plan {
+            kind: job.data.kind,
+            options: SplatOptions { n_planned_steps, ..job.options.clone() },
+            evaluators: Evaluators { at_marks, most_at_marks: usize::MAX, at_end: thorough },
+            limits: job.limits,
+            tell: if self.args.json { Tell::Nothing } else { Tell::Bar },
+        };
+        let session = training::train(self.gpu.clone(), plan, &(job.keyframes)(), &self.stop)?;
+        if self.stop.asked() && !session.is_over() {
+            bail!("stopped before its end: the same command with --out {} goes on from there", self.out.display());
+        }
+        session.conclude()
+    }
+
+    fn settings(&self, job: &Job<'_>) -> Settings {
+        let data = &job.data.data;
+        let n_test = data.of_split(Split::Test).len();
+        Settings {
+            data: job.data.path.clone(),
+            method: job.data.kind.name().to_owned(),
+            seed: job.options.seed,
+            max_splats: job.options.max_splats,
+            max_bytes: job.options.max_bytes,
+            seconds: job.limits.seconds,
+            steps: job.limits.steps,
+            scale: self.args.images.scale,
+            holdout: self.args.images.holdout.clone(),
+            keyframes: self.args.images.keyframes.clone(),
+            n_train: data.keyframes.len() - n_test,
+            n_test,
+            disturbed: job.disturbed.clone(),
+            variant: job.variant.clone(),
+            adapter: self.gpu.describe(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+        }
+    }
+
+    fn tell(&self, run: &Run, is_kept: bool) -> anyhow::Result<()> {
+        #[derive(Serialize)]
+        struct Event<'a> {
+            event: &'static str,
+            kept: bool,
+            #[serde(flatten)]
+            run: &'a Run,
+        }
+        if self.args.json {
+            return print::json(&Event { event: "run", kept: is_kept, run });
+        }
+        let (end, kept) = (&run.end, if is_kept { ", done before" } else { "" });
+        Ok(print::line(format_args!(
+            "run {} of {}  {:40} {:7.1} s  step {:6}  {:8} splats  {:.2} dB{kept}",
+            self.n_done,
+            self.n_all,
+            run.name,
+            end.seconds,
+            end.step,
+            end.primitives,
+            run.psnr()
+        ))?)
+    }
+}
+
+fn of_mark(mark: &Eval) -> Measured {
+    Measured {
+        seconds: mark.seconds,
+        step: mark.step,
+        psnr: mark.scores.psnr,
+        ssim: mark.scores.ssim,
+        lpips: mark.scores.lpips,
+        depth_rmse_m: mark.scores.depth_rmse_m,
+        primitives: mark.primitives,
+        bytes: mark.bytes,
+    }
+}
+
+fn read(place: &Path) -> anyhow::Result<Run> {
+    let told = || format!("{} is no finished run: remove it to have it done again", place.display());
+    let text = std::fs::read_to_string(place).with_context(told)?;
+    serde_json::from_str(&text).with_context(told)
+}
+
+/// The first setting that differs, in words.
+fn difference(kept: &Settings, wanted: &Settings) -> anyhow::Result<Option<String>> {
+    let fields = |settings: &Settings| serde_json::to_value(settings).context("settings are plain data");
+    let (kept, wanted) = (fields(kept)?, fields(wanted)?);
+    let Some(wanted) = wanted.as_object() else { bail!("settings are an object") };
+    Ok(wanted
+        .iter()
+        .find(|(key, value)| kept[key.as_str()] != **value)
+        .map(|(key, value)| format!("{key} ({} there, {value} now)", kept[key.as_str()])))
+}
+
+/// A name for data from its path, with a number where it is taken already.
+fn free_name(path: &Path, taken: &mut HashSet<String>) -> String {
+    let whole = path.canonicalize().unwrap_or_else(|_| path.to_owned());
+    let stem = if whole.is_dir() { whole.file_name() } else { whole.file_stem() };
+    let stem = stem.map_or_else(|| "data".to_owned(), |stem| stem.to_string_lossy().into_owned());
+    let mut name = stem.clone();
+    let mut n = 2;
+    while !taken.insert(name.clone()) {
+        name = format!("{stem}-{n}");
+        n += 1;
+    }
+    name
+}
+
+/// A name as a file's: nothing but letters, digits, dots and dashes.
+fn file_name(name: &str) -> String {
+    name.chars().map(|letter| if letter.is_alphanumeric() || letter == '.' { letter } else { '-' }).collect()
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+
+    /// A run that ended with these figures.
+    pub(crate) fn run(name: &str, curve: &[(f64, f64)], n_splats: u64) -> Run {
+        let measured = |&(seconds, psnr): &(f64, f64)| Measured {
+            seconds,
+            step: 10,
+            psnr: Some(psnr),
+            ssim: None,
+            lpips: None,
+            depth_rmse_m: None,
+            primitives: n_splats,
+            bytes: 0,
+        };
+        let settings = Settings {
+            data: "fox".into(),
+            method: "splat".into(),
+            seed: 1,
+            max_splats: 1000,
+            max_bytes: None,
+            seconds: Some(4.0),
+            steps: None,
+            scale: None,
+            holdout: None,
+            keyframes: None,
+            n_train: 7,
+            n_test: 1,
+            disturbed: None,
+            variant: None,
+            adapter: "none".into(),
+            version: "0".into(),
+        };
+        let marks = curve.iter().map(measured).collect();
+        Run { name: name.into(), settings, marks, end: measured(curve.last().expect("a point")) }
+    }
+
+    #[test]
+    fn a_run_comes_back_from_its_file() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let place = folder.path().join("run.json");
+        let written = run("fox seed 1", &[(0.25, 12.3), (4.0, 21.456_789)], 900);
+        run_folder::write_json(&place, &written).expect("written");
+        assert_eq!(read(&place).expect("read"), written);
+        std::fs::write(&place, "{").expect("written");
+        assert!(read(&place).expect_err("cut off").to_string().contains("run.json"));
+    }
+
+    #[test]
+    fn a_difference_names_the_setting() {
+        let kept = run("a", &[(1.0, 20.0)], 1).settings;
+        assert_eq!(difference(&kept, &kept).expect("plain"), None);
+        let wanted = Settings { max_splats: 2000, ..kept.clone() };
+        let told = difference(&kept, &wanted).expect("plain").expect("one differs");
+        assert_eq!(told, "max_splats (1000 there, 2000 now)");
+    }
+
+    #[test]
+    fn names_are_free_and_fit_for_files() {
+        let mut taken = HashSet::new();
+        assert_eq!(free_name(Path::new("absent/fox.mcap"), &mut taken), "fox");
+        assert_eq!(free_name(Path::new("other/fox.mcap"), &mut taken), "fox-2");
+        assert_eq!(file_name("a b/c 0.5 mm"), "a-b-c-0.5-mm");
+    }
+
+    #[test]
+    fn an_end_at_a_mark_counts_once() {
+        let mut run = run("a", &[(1.0, 20.0), (4.0, 24.0)], 1);
+        assert_eq!(run.curve(), [(1.0, 20.0), (4.0, 24.0)]);
+        run.end = Measured { seconds: 6.0, psnr: Some(25.0), ..run.end };
+        assert_eq!(run.curve(), [(1.0, 20.0), (4.0, 24.0), (6.0, 25.0)]);
+    }
+}

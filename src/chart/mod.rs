@@ -1,0 +1,365 @@
+//! Charts: lines over one axis each way, drawn once for SVG and PNG.
+//!
+//! Colors are those of Okabe and Ito (2008), which color-blind people can tell apart; lines differ by the form of their dots
+//! too, so that a gray print can be read.
+
+mod axis;
+pub(crate) mod drawing;
+pub(crate) mod raster;
+
+pub(crate) use axis::{Axis, Scale, short};
+use drawing::{Anchor, Color, Drawing, Shape, TextSize};
+use raster::text_width;
+
+/// A chart in words and numbers.
+#[derive(Clone, Debug)]
+pub(crate) struct Chart {
+    pub(crate) title: String,
+    /// What the points and bands are.
+    pub(crate) subtitle: String,
+    pub(crate) x: Axis,
+    pub(crate) y: Axis,
+    pub(crate) lines: Vec<Line>,
+    /// Levels on the y axis worth a dashed line, with what they mean.
+    pub(crate) floors: Vec<(f64, String)>,
+    /// Places on the x axis worth a dashed line.
+    pub(crate) rules: Vec<Rule>,
+}
+
+/// One line of a chart.
+#[derive(Clone, Debug)]
+pub(crate) struct Line {
+    pub(crate) label: String,
+    /// In the order of x.
+    pub(crate) points: Vec<Point>,
+    /// Told apart from our own lines by dashes.
+    pub(crate) is_foreign: bool,
+}
+
+/// A point, and how far the values behind it spread.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Point {
+    pub(crate) x: f64,
+    pub(crate) y: f64,
+    pub(crate) low: f64,
+    pub(crate) high: f64,
+}
+
+/// A place on the x axis, explained above the chart.
+#[derive(Clone, Debug)]
+pub(crate) struct Rule {
+    pub(crate) x: f64,
+    pub(crate) label: String,
+    /// The line it belongs to.
+    pub(crate) line_ix: usize,
+}
+
+const COLORS: [Color; 7] =
+    [[0, 114, 178], [213, 94, 0], [0, 158, 115], [204, 121, 167], [230, 159, 0], [86, 180, 233], [0, 0, 0]];
+const INK: Color = [40, 40, 40];
+const FAINT_INK: Color = [95, 95, 95];
+const GRID: Color = [226, 226, 226];
+
+const WIDTH: f64 = 960.0;
+const PLOT_HEIGHT: f64 = 380.0;
+const LEFT: f64 = 66.0;
+const MARGIN: f64 = 18.0;
+/// Room below the plot for tick labels and the axis label.
+const BELOW: f64 = 56.0;
+const TITLE_HEIGHT: f64 = 54.0;
+const RULE_ROW: f64 = 15.0;
+const LEGEND_SWATCH: f64 = 34.0;
+const LEGEND_ROW: f64 = 15.0;
+/// Letters a line of the legend.
+const LEGEND_LETTERS: usize = 26;
+
+/// Where the plot lies, and what its axes span.
+struct Plot {
+    left: f64,
+    right: f64,
+    top: f64,
+    bottom: f64,
+    x: axis::Span,
+    y: axis::Span,
+}
+
+impl Plot {
+    fn x(&self, value: f64) -> f64 {
+        self.left + (self.right - self.left) * self.x.frac(value)
+    }
+
+    fn y(&self, value: f64) -> f64 {
+        self.bottom - (self.bottom - self.top) * self.y.frac(value)
+    }
+
+    fn at(&self, point: &Point) -> [f64; 2] {
+        [self.x(point.x), self.y(point.y)]
+    }
+}
+
+impl Chart {
+    /// The chart drawn; the legend stands beside the data, never over them.
+    pub(crate) fn draw(&self) -> Drawing {
+        let legend = self.legend();
+        let longest = legend.iter().flat_map(|entry| &entry.rows).map(|row| text_width(row, TextSize::Usual));
+        let legend_width = LEGEND_SWATCH + longest.fold(0.0, f64::max);
+        let top = TITLE_HEIGHT + RULE_ROW * self.rules.len() as f64;
+        let points = || self.lines.iter().flat_map(|line| &line.points);
+        let heights = points().flat_map(|point| [point.low, point.high]).chain(self.floors.iter().map(|floor| floor.0));
+        let places = points().map(|point| point.x).chain(self.rules.iter().map(|rule| rule.x));
+        let plot = Plot {
+            left: LEFT,
+            right: WIDTH - legend_width - 2.0 * MARGIN,
+            top,
+            bottom: top + PLOT_HEIGHT,
+            x: self.x.span(places),
+            y: self.y.span(heights),
+        };
+        let size = [WIDTH, plot.bottom + BELOW];
+        let mut shapes = Vec::new();
+        self.draw_grid(&plot, &mut shapes);
+        self.draw_floors(&plot, &mut shapes);
+        for (ix, line) in self.lines.iter().enumerate() {
+            draw_band(line, color_of(ix), &plot, &mut shapes);
+        }
+        self.draw_rules(&plot, &mut shapes);
+        for (ix, line) in self.lines.iter().enumerate() {
+            draw_line(line, ix, &plot, &mut shapes);
+        }
+        self.draw_words(&plot, &mut shapes);
+        draw_legend(&legend, &plot, &mut shapes);
+        Drawing { size, shapes }
+    }
+
+    fn draw_grid(&self, plot: &Plot, shapes: &mut Vec<Shape>) {
+        let mut free_from = f64::MIN;
+        for (value, label) in &plot.x.ticks {
+            let x = plot.x(*value);
+            shapes.push(line_between([x, plot.top], [x, plot.bottom], GRID, 1.0));
+            let half = 0.5 * text_width(label, TextSize::Usual);
+            if x - half < free_from {
+                continue;
+            }
+            free_from = x + half + 6.0;
+            shapes.push(text([x, plot.bottom + 14.0], label, INK, Anchor::Middle));
+        }
+        for (value, label) in &plot.y.ticks {
+            let y = plot.y(*value);
+            shapes.push(line_between([plot.left, y], [plot.right, y], GRID, 1.0));
+            shapes.push(text([plot.left - 8.0, y], label, INK, Anchor::End));
+        }
+        let corners = [[plot.left, plot.top], [plot.left, plot.bottom], [plot.right, plot.bottom]];
+        shapes.push(Shape::Line { points: corners.to_vec(), color: FAINT_INK, width: 1.0, dash: None });
+    }
+
+    fn draw_floors(&self, plot: &Plot, shapes: &mut Vec<Shape>) {
+        for (value, _) in &self.floors {
+            let y = plot.y(*value);
+            let points = vec![[plot.left, y], [plot.right, y]];
+            shapes.push(Shape::Line { points, color: FAINT_INK, width: 1.2, dash: Some([2.0, 3.0]) });
+        }
+    }
+
+    /// Each rule has a row of its own above the plot, so that no two labels meet.
+    fn draw_rules(&self, plot: &Plot, shapes: &mut Vec<Shape>) {
+        for (row, rule) in self.rules.iter().enumerate() {
+            let (x, color) = (plot.x(rule.x), color_of(rule.line_ix));
+            let y = TITLE_HEIGHT + RULE_ROW * (row as f64 + 0.4);
+            let points = vec![[x, y + 7.0], [x, plot.bottom]];
+            shapes.push(Shape::Line { points, color, width: 1.2, dash: Some([5.0, 4.0]) });
+            let half = 0.5 * text_width(&rule.label, TextSize::Usual);
+            let center = x.min(plot.right - half).max(plot.left + half);
+            shapes.push(text([center, y], &rule.label, color, Anchor::Middle));
+        }
+    }
+
+    fn draw_words(&self, plot: &Plot, shapes: &mut Vec<Shape>) {
+        let size = TextSize::Title;
+        let anchor = Anchor::Start;
+        let at = [LEFT, 20.0];
+        shapes.push(Shape::Text { at, text: self.title.clone(), color: INK, size, anchor, upright: false });
+        shapes.push(text([LEFT, 40.0], &self.subtitle, FAINT_INK, Anchor::Start));
+        let middle = 0.5 * (plot.left + plot.right);
+        shapes.push(text([middle, plot.bottom + 38.0], &self.x.label, INK, Anchor::Middle));
+        let at = [18.0, 0.5 * (plot.top + plot.bottom)];
+        let (size, anchor) = (TextSize::Usual, Anchor::Middle);
+        shapes.push(Shape::Text { at, text: self.y.label.clone(), color: INK, size, anchor, upright: true });
+    }
+
+    fn legend(&self) -> Vec<Entry> {
+        let lines = self.lines.iter().enumerate().map(|(ix, line)| Entry {
+            swatch: Swatch::Line { ix, is_foreign: line.is_foreign },
+            rows: wrapped(&line.label, LEGEND_LETTERS),
+        });
+        let floors = self.floors.iter();
+        let floors = floors.map(|(_, label)| Entry { swatch: Swatch::Floor, rows: wrapped(label, LEGEND_LETTERS) });
+        lines.chain(floors).collect()
+    }
+}
+
+/// One entry of the legend.
+struct Entry {
+    swatch: Swatch,
+    rows: Vec<String>,
+}
+
+enum Swatch {
+    Line { ix: usize, is_foreign: bool },
+    Floor,
+}
+
+fn draw_legend(legend: &[Entry], plot: &Plot, shapes: &mut Vec<Shape>) {
+    let left = plot.right + MARGIN;
+    let mut y = plot.top + 8.0;
+    for entry in legend {
+        let points = vec![[left, y], [left + 24.0, y]];
+        match entry.swatch {
+            Swatch::Line { ix, is_foreign } => {
+                let dash = is_foreign.then_some(FOREIGN_DASH);
+                shapes.push(Shape::Line { points, color: color_of(ix), width: 2.0, dash });
+                draw_dot([left + 12.0, y], ix, shapes);
+            }
+            Swatch::Floor => {
+                shapes.push(Shape::Line { points, color: FAINT_INK, width: 1.2, dash: Some([2.0, 3.0]) });
+            }
+        }
+        for row in &entry.rows {
+            shapes.push(text([left + LEGEND_SWATCH, y], row, INK, Anchor::Start));
+            y += LEGEND_ROW;
+        }
+        y += 6.0;
+    }
+}
+
+const FOREIGN_DASH: [f64; 2] = [6.0, 3.0];
+
+fn color_of(line_ix: usize) -> Color {
+    COLORS[line_ix % COLORS.len()]
+}
+
+fn draw_band(line: &Line, color: Color, plot: &Plot, shapes: &mut Vec<Shape>) {
+    if line.points.len() < 2 || line.points.iter().all(|point| point.low == point.high) {
+        return;
+    }
+    let above = line.points.iter().map(|point| [plot.x(point.x), plot.y(point.high)]);
+    let below = line.points.iter().rev().map(|point| [plot.x(point.x), plot.y(point.low)]);
+    shapes.push(Shape::Area { points: above.chain(below).collect(), color, opacity_frac: 0.2 });
+}
+
+fn draw_line(line: &Line, ix: usize, plot: &Plot, shapes: &mut Vec<Shape>) {
+    let points: Vec<[f64; 2]> = line.points.iter().map(|point| plot.at(point)).collect();
+    let dash = line.is_foreign.then_some(FOREIGN_DASH);
+    if points.len() > 1 {
+        shapes.push(Shape::Line { points: points.clone(), color: color_of(ix), width: 2.0, dash });
+    }
+    for at in points {
+        draw_dot(at, ix, shapes);
+    }
+}
+
+/// A dot whose form tells the line: disc, square, triangle, diamond.
+fn draw_dot([x, y]: [f64; 2], line_ix: usize, shapes: &mut Vec<Shape>) {
+    let (n_corners, first_turn, radius) = [(24, 0.0, 3.6), (4, 0.125, 4.6), (3, 0.75, 5.2), (4, 0.0, 5.0)][line_ix % 4];
+    let corner = |ix: u32| {
+        let angle = std::f64::consts::TAU * (f64::from(ix) / f64::from(n_corners) + first_turn);
+        [x + radius * angle.cos(), y + radius * angle.sin()]
+    };
+    let points = (0..n_corners).map(corner).collect();
+    shapes.push(Shape::Area { points, color: color_of(line_ix), opacity_frac: 1.0 });
+}
+
+fn line_between(from: [f64; 2], to: [f64; 2], color: Color, width: f64) -> Shape {
+    Shape::Line { points: vec![from, to], color, width, dash: None }
+}
+
+fn text(at: [f64; 2], text: &str, color: Color, anchor: Anchor) -> Shape {
+    Shape::Text { at, text: text.to_owned(), color, size: TextSize::Usual, anchor, upright: false }
+}
+
+/// Text in rows of at most `n_letters`, broken after spaces and, where a word is longer, anywhere.
+fn wrapped(text: &str, n_letters: usize) -> Vec<String> {
+    let mut rows = vec![String::new()];
+    for word in text.split_inclusive(' ') {
+        let mut left: Vec<char> = word.chars().collect();
+        while !left.is_empty() {
+            let row = rows.last_mut().expect("there is always a row");
+            let n_used = row.chars().count();
+            let n_word = left.iter().filter(|letter| **letter != ' ').count();
+            if n_used > 0 && n_used + n_word > n_letters {
+                rows.push(String::new());
+                continue;
+            }
+            row.extend(left.drain(..left.len().min(n_letters + 1 - n_used.min(n_letters))));
+        }
+    }
+    rows.iter().map(|row| row.trim_end().to_owned()).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn long_labels_are_broken_into_rows() {
+        assert_eq!(wrapped("sa, splat", 26), ["sa, splat"]);
+        assert_eq!(wrapped("one two three", 8), ["one two", "three"]);
+        let rows = wrapped(&"x".repeat(60), 26);
+        assert!(rows.iter().all(|row| row.len() <= 27), "{rows:?}");
+        assert_eq!(rows.concat(), "x".repeat(60));
+    }
+
+    #[test]
+    fn nothing_is_drawn_outside_and_the_legend_lies_beside_the_data() {
+        let point = |x: f64, y: f64| Point { x, y, low: y - 1.0, high: y + 0.5 };
+        let line = |label: &str| Line {
+            label: label.into(),
+            points: vec![point(0.25, 11.0), point(60.0, 36.0)],
+            is_foreign: false,
+        };
+        let chart = Chart {
+            title: "A title".into(),
+            subtitle: "median".into(),
+            x: Axis { label: "seconds".into(), scale: Scale::Log, ticks: vec![0.25, 1.0, 60.0] },
+            y: Axis { label: "PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() },
+            lines: vec![line("a"), line("a much longer name of some other data")],
+            floors: Vec::new(),
+            rules: vec![Rule { x: 60.0, label: "a long word about the very end".into(), line_ix: 0 }],
+        };
+        let drawing = chart.draw();
+        let [width, height] = drawing.size;
+        for shape in &drawing.shapes {
+            let (points, room) = match shape {
+                Shape::Line { points, .. } | Shape::Area { points, .. } => (points.clone(), 0.0),
+                Shape::Text { at, text, size, anchor, upright, .. } => {
+                    let room = if *upright { 0.0 } else { text_width(text, *size) };
+                    let from = match anchor {
+                        Anchor::Start => 0.0,
+                        Anchor::Middle => -0.5 * room,
+                        Anchor::End => -room,
+                    };
+                    (vec![[at[0] + from, at[1]]], room)
+                }
+            };
+            for [x, y] in points {
+                assert!(x >= 0.0 && x + room <= width && (0.0..=height).contains(&y), "{shape:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn an_empty_chart_can_be_drawn() {
+        let axis = |scale| Axis { label: "x".into(), scale, ticks: Vec::new() };
+        let chart = Chart {
+            title: "nothing yet".into(),
+            subtitle: String::new(),
+            x: axis(Scale::Log),
+            y: axis(Scale::Linear),
+            lines: Vec::new(),
+            floors: Vec::new(),
+            rules: Vec::new(),
+        };
+        let drawing = chart.draw();
+        assert!(!drawing.svg().contains("NaN"));
+        assert!(raster::png(&drawing).is_ok());
+    }
+}

@@ -1,0 +1,238 @@
+//! `fieldrig bench budget`: accuracy over the number of splats, and the number the trainer takes by itself.
+
+use crate::bench::page::{Findings, Table};
+use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
+use crate::bench::statistics::{db_per_doubling, extent, median};
+use crate::chart::{Axis, Chart, Line, Point, Rule, Scale, short};
+use crate::exit::{self, BadArgument, Exit};
+use crate::training;
+use serde::Serialize;
+use std::collections::HashSet;
+use std::path::PathBuf;
+use trainer::splat::SplatOptions;
+
+/// Length of a run where no flag says.
+const USUAL_SECONDS: f64 = 60.0;
+/// More splats than any rig file may ask for.
+const MOST_SPLATS: i64 = 100_000_000;
+/// A doubling that gains less than this does not pay, dB.
+const PAYS_DB: f64 = 0.1;
+
+/// Flags of `bench budget`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// A nerfstudio or TUM RGB-D folder, or a recording (.mcap)
+    data: PathBuf,
+    /// Caps on the number of splats, 1 to 100000000, separated by commas
+    #[arg(
+        long,
+        value_name = "N,...",
+        value_delimiter = ',',
+        default_value = "2000,4000,8000,16000,32000,64000,128000,256000,512000,1000000",
+        value_parser = clap::value_parser!(u32).range(1..=MOST_SPLATS)
+    )]
+    splats: Vec<u32>,
+    /// Length of a run in seconds of training; loading and scoring do not count [default: 60, unless --steps is given]
+    #[arg(long, value_name = "S")]
+    seconds: Option<f64>,
+    /// Length of a run in optimiser steps
+    #[arg(long, value_name = "N")]
+    steps: Option<u64>,
+    /// Runs of each cap, 1 to 1000, with seeds counted up from --seed
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    seeds: u64,
+    #[command(flatten)]
+    bench: BenchArgs,
+}
+
+/// The runs under one cap.
+#[derive(Clone, Debug, Serialize)]
+struct Capped {
+    /// `None`: the trainer's own choice.
+    cap: Option<u32>,
+    /// Median at the end.
+    primitives: f64,
+    /// Median at the end, dB.
+    psnr: f64,
+    psnr_extent: [f64; 2],
+    runs: Vec<Run>,
+}
+
+/// What more splats gained between two caps.
+#[derive(Debug, Serialize)]
+struct Gain {
+    to_cap: Option<u32>,
+    from_primitives: f64,
+    to_primitives: f64,
+    db_per_doubling: f64,
+}
+
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let limits = training::limits(args.seconds, args.steps, USUAL_SECONDS)?;
+    if args.bench.training.max_splats.is_some() {
+        return Err(BadArgument("--max-splats: this bench sets the cap itself, name caps with --splats".into()).into());
+    }
+    let mut caps: Vec<Option<u32>> = args.splats.iter().copied().map(Some).collect();
+    caps.sort_unstable();
+    caps.dedup();
+    // The trainer's own choice comes first: it is what most people ask for.
+    caps.insert(0, None);
+    let mut runs = Runs::open(&args.bench, crate::commands::open_gpu()?)?;
+    runs.expect(caps.len() * usize::try_from(args.seeds)?);
+    let data = runs.load(&args.data, &mut HashSet::new())?;
+    let mut capped = Vec::new();
+    let mut page = None;
+    for cap in caps {
+        let mut finished = Vec::new();
+        let cap_name = cap.map_or_else(|| "no cap".to_owned(), |cap| format!("cap {cap}"));
+        for seed in data.options.seed..data.options.seed.saturating_add(args.seeds) {
+            let max_splats = cap.unwrap_or(SplatOptions::default().max_splats);
+            finished.push(runs.run(Job {
+                name: format!("budget {} {cap_name} seed {seed}", data.name),
+                data: &data,
+                options: SplatOptions { seed, max_splats, ..data.options.clone() },
+                limits,
+                disturbed: None,
+                variant: None,
+                keyframes: &|| data.data.keyframes.clone(),
+                is_thorough: false,
+            })?);
+        }
+        capped.extend(Capped::of(cap, finished));
+        page = Some(findings(args, &runs, &data, &capped)?);
+    }
+    if let Some((findings, page)) = page {
+        findings.tell(&page, args.bench.json)?;
+    }
+    Ok(exit::after(&data.data.losses))
+}
+
+impl Capped {
+    fn of(cap: Option<u32>, runs: Vec<Run>) -> Option<Self> {
+        let sizes: Vec<f64> = runs.iter().map(|run| run.end.primitives as f64).collect();
+        let ends: Vec<f64> = runs.iter().map(Run::psnr).collect();
+        Some(Self { cap, primitives: median(&sizes)?, psnr: median(&ends)?, psnr_extent: extent(&ends)?, runs })
+    }
+
+    fn point(&self) -> Point {
+        let [low, high] = self.psnr_extent;
+        Point { x: self.primitives.max(1.0), y: self.psnr, low, high }
+    }
+
+    fn cap_in_words(&self) -> String {
+        self.cap.map_or_else(|| "none".to_owned(), |cap| cap.to_string())
+    }
+}
+
+/// What doubling gained between neighboring caps, where the number of splats grew.
+fn gains(by_cap: &[&Capped]) -> Vec<Gain> {
+    let pairs = by_cap.windows(2);
+    let gain = |pair: &[&Capped]| {
+        let [fewer, more] = [pair[0], pair[1]].map(|capped| (capped.primitives, capped.psnr));
+        let db_per_doubling = db_per_doubling(fewer, more)?;
+        Some(Gain { to_cap: pair[1].cap, from_primitives: fewer.0, to_primitives: more.0, db_per_doubling })
+    };
+    pairs.filter_map(gain).collect()
+}
+
+/// Everything known so far, written.
+fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -> anyhow::Result<(Findings, PathBuf)> {
+    let by_cap: Vec<&Capped> = capped.iter().filter(|capped| capped.cap.is_some()).collect();
+    let own = capped.iter().find(|capped| capped.cap.is_none());
+    let gains = gains(&by_cap);
+    let length = args.steps.map_or_else(
+        || format!("{} s", short(args.seconds.unwrap_or(USUAL_SECONDS))),
+        |steps| format!("{steps} steps"),
+    );
+    let spread = if args.seeds > 1 {
+        format!("median of {} seeds, band: lowest to highest", args.seeds)
+    } else {
+        "one run a cap".to_owned()
+    };
+    let subtitle = format!("{}, {}, {length}; {spread}", data.name, data.kind.name());
+    let x = |label: &str| Axis { label: label.to_owned(), scale: Scale::Log, ticks: Vec::new() };
+    let line = |label: &str, points: Vec<Point>| Line { label: label.to_owned(), points, is_foreign: false };
+    let own_point = own.map(Capped::point);
+    let own_rule = own.map(|own| Rule {
+        x: own.primitives.max(1.0),
+        label: format!("the trainer's own choice: {} splats, {:.2} dB", own.primitives, own.psnr),
+        line_ix: 1,
+    });
+    let mut points: Vec<Point> = by_cap.iter().map(|capped| capped.point()).collect();
+    points.sort_by(|a, b| a.x.total_cmp(&b.x));
+    let accuracy = Chart {
+        title: "PSNR of held-out images over the number of splats".into(),
+        subtitle: subtitle.clone(),
+        x: x("splats at the end (log)"),
+        y: Axis { label: "test PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() },
+        lines: vec![line("with a cap", points), line("no cap given", own_point.into_iter().collect())],
+        floors: Vec::new(),
+        rules: own_rule.into_iter().collect(),
+    };
+    let gain_point = |gain: &Gain| {
+        let x = (gain.from_primitives * gain.to_primitives).sqrt();
+        Point { x, y: gain.db_per_doubling, low: gain.db_per_doubling, high: gain.db_per_doubling }
+    };
+    let worth = Chart {
+        title: "What doubling the splats gains".into(),
+        subtitle: format!("{subtitle}; each point between two neighboring caps"),
+        x: x("splats (log)"),
+        y: Axis { label: "gain, dB a doubling".into(), scale: Scale::Linear, ticks: Vec::new() },
+        lines: vec![line("gain of a doubling", gains.iter().map(gain_point).collect())],
+        floors: vec![(PAYS_DB, format!("{PAYS_DB} dB: less does not pay"))],
+        rules: Vec::new(),
+    };
+    let row = |capped: &Capped| {
+        let gain = gains.iter().find(|gain| capped.cap.is_some() && gain.to_cap == capped.cap);
+        vec![
+            capped.cap_in_words(),
+            format!("{:.0}", capped.primitives),
+            format!("{:.2}", capped.psnr),
+            gain.map_or_else(|| "-".to_owned(), |gain| format!("{:+.2}", gain.db_per_doubling)),
+        ]
+    };
+    let head = ["cap", "splats", "PSNR, dB", "gain a doubling, dB"].map(str::to_owned).to_vec();
+    let findings = Findings {
+        name: "budget",
+        title: format!("Accuracy over size: {}", data.name),
+        sentences: vec![
+            format!(
+                "Each point is a model trained for {length} under a cap on its splats and scored on held-out images; \
+                 the run without a cap shows what the trainer takes by itself (at most {}).",
+                SplatOptions::default().max_splats
+            ),
+            format!("A doubling of the splats that gains less than {PAYS_DB} dB does not pay."),
+            format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),
+        ],
+        charts: vec![("", accuracy), ("-gain", worth)],
+        tables: vec![Table { title: format!("After {length}"), head, rows: capped.iter().map(row).collect() }],
+        numbers: serde_json::json!({
+            "bench": "budget",
+            "data": data.path,
+            "method": data.kind.name(),
+            "adapter": runs.adapter(),
+            "own_choice": own,
+            "caps": by_cap,
+            "gains": gains,
+        }),
+    };
+    let page = findings.write(runs.out())?;
+    Ok((findings, page))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bench::runs::tests::run;
+
+    #[test]
+    fn gains_stand_between_caps_that_filled() {
+        let capped = |cap: u32, n_splats: u64, psnr: f64| {
+            Capped::of(Some(cap), vec![run("a", &[(1.0, psnr)], n_splats)]).expect("a run")
+        };
+        let all = [capped(1000, 1000, 20.0), capped(4000, 4000, 23.0), capped(8000, 4100, 23.1)];
+        let gains = gains(&all.iter().collect::<Vec<_>>());
+        assert_eq!((gains.len(), gains[0].to_cap), (1, Some(4000)), "{gains:?}");
+        assert!((gains[0].db_per_doubling - 1.5).abs() < 1e-12);
+    }
+}

@@ -1,0 +1,37 @@
+//! `fieldrig bench`: how fast, how good after how long, how large for how good, and how sturdy.
+
+mod budget;
+mod curve;
+mod kernels;
+mod stability;
+
+use crate::exit::Exit;
+use clap::{Parser, Subcommand};
+
+/// What to measure.
+#[derive(Debug, Parser)]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Debug, Subcommand)]
+enum What {
+    /// Time of a picture and of a training step on a synthetic cloud of splats, by size and count
+    Kernels(kernels::Args),
+    /// PSNR of held-out images over seconds of training, several seeds each; peers' figures can be drawn in
+    Curve(curve::Args),
+    /// PSNR of held-out images over the number of splats, and what the trainer takes by itself
+    Budget(budget::Args),
+    /// PSNR of held-out images over the size of a disturbance of the training images, and where it breaks
+    Stability(stability::Args),
+}
+
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    match &args.what {
+        What::Kernels(args) => kernels::run(args).map(|()| Exit::Done),
+        What::Curve(args) => curve::run(args),
+        What::Budget(args) => budget::run(args),
+        What::Stability(args) => stability::run(args),
+    }
+}

@@ -1,0 +1,76 @@
+//! One training from keyframes on disk to a model: what `train` does once, and `bench` many times over.
+
+use crate::config::USUAL_SEED;
+use crate::data::Data;
+use crate::exit::BadArgument;
+use crate::method::{self, Kind};
+use crate::session::{Evaluators, Limits, Session, Tell};
+use crate::stop::Stop;
+use crate::training_args::{Refine, TrainingArgs};
+use std::sync::Arc;
+use std::time::Instant;
+use trainer::Keyframe;
+use trainer::gpu::Gpu;
+use trainer::splat::SplatOptions;
+
+/// All that settles a training beside its keyframes.
+pub(crate) struct Plan {
+    pub(crate) kind: Kind,
+    pub(crate) options: SplatOptions,
+    pub(crate) evaluators: Evaluators,
+    pub(crate) limits: Limits,
+    pub(crate) tell: Tell,
+}
+
+/// Trains a fresh model until a limit, or until `stop` is asked.
+///
+/// The clock starts when everything is compiled; seeding counts.
+pub(crate) fn train(gpu: Arc<Gpu>, plan: Plan, keyframes: &[Arc<Keyframe>], stop: &Stop) -> anyhow::Result<Session> {
+    let mut method = plan.kind.start(gpu.clone(), plan.options)?;
+    method.prepare()?;
+    drive(Session::new(gpu, method, plan.evaluators, plan.limits, plan.tell), keyframes, stop)
+}
+
+/// Starts the clock, pushes the keyframes, and trains until a limit, or until `stop` is asked.
+pub(crate) fn drive(mut session: Session, keyframes: &[Arc<Keyframe>], stop: &Stop) -> anyhow::Result<Session> {
+    session.start_clock(Instant::now());
+    for keyframe in keyframes {
+        session.push(keyframe)?;
+    }
+    while !stop.asked() && !session.is_over() {
+        session.step(u64::MAX)?;
+    }
+    Ok(session)
+}
+
+/// The scene model: the recording's rig file says which, with the flags over it; a folder has the flags only.
+pub(crate) fn model(
+    args: &TrainingArgs,
+    data: &Data,
+    steps: Option<u64>,
+    software: bool,
+) -> Result<(Kind, SplatOptions), BadArgument> {
+    // A trial takes hundreds of steps more: on a processor that is minutes.
+    let cameras = args.cameras(data.rig.is_some(), if software { Refine::None } else { Refine::Auto })?;
+    if let Some(rig) = &data.rig {
+        return Ok((Kind::of_rig(rig)?, SplatOptions { cameras, ..method::options(&rig.train, steps)? }));
+    }
+    let usual = SplatOptions::default();
+    let options = SplatOptions {
+        seed: args.seed.unwrap_or(USUAL_SEED),
+        max_splats: args.max_splats.map_or(usual.max_splats, |n| n.try_into().unwrap_or(u32::MAX)),
+        max_bytes: args.max_bytes,
+        cameras,
+        n_planned_steps: steps.unwrap_or(usual.n_planned_steps),
+        ..usual
+    };
+    Ok((args.method.unwrap_or(Kind::Splat), options))
+}
+
+/// When to stop, from `--seconds` and `--steps`; after `usual_secs` when neither is given.
+pub(crate) fn limits(seconds: Option<f64>, steps: Option<u64>, usual_secs: f64) -> Result<Limits, BadArgument> {
+    if seconds.is_some_and(|seconds| seconds.is_nan() || seconds < 0.0) {
+        return Err(BadArgument("--seconds: must be a number of at least 0".into()));
+    }
+    Ok(Limits { seconds: seconds.or(steps.is_none().then_some(usual_secs)), steps })
+}

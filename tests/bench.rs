@@ -1,0 +1,149 @@
+//! `fieldrig bench curve`, `budget` and `stability` as their users run them, on a scene of a few tiny photos.
+
+use image::RgbImage;
+use serde_json::{Value, json};
+use std::path::Path;
+use std::process::{Command, Output};
+
+/// Photos of the scene; two of them are held out.
+const N_PHOTOS: u32 = 12;
+const SIZE_PX: [u32; 2] = [32, 24];
+
+/// A nerfstudio folder: a camera slides along a colorful wall, 1 m away from it.
+fn scene(folder: &Path) {
+    let (mut frames, focal_px) = (Vec::new(), 30.0);
+    for ix in 0..N_PHOTOS {
+        let x_m = 0.05 * f64::from(ix);
+        let color = |u: u32, v: u32| {
+            let (x, y) = (x_m + (f64::from(u) - 15.5) / focal_px, (f64::from(v) - 11.5) / focal_px);
+            #[expect(clippy::cast_possible_truncation, reason = "27 to 227")]
+            let wave = |phase: f64| (127.0 + 100.0 * (8.0 * x + phase).sin() * (7.0 * y + phase).cos()) as u8;
+            image::Rgb([wave(0.0), wave(1.0), wave(2.0)])
+        };
+        let name = format!("{ix:02}.png");
+        RgbImage::from_fn(SIZE_PX[0], SIZE_PX[1], color).save(folder.join(&name)).expect("room on the disk");
+        // An OpenGL camera that looks along -z, as nerfstudio has it.
+        let rows = [[1.0, 0.0, 0.0, x_m], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 0.0, 1.0]];
+        frames.push(json!({ "file_path": name, "transform_matrix": rows }));
+    }
+    let [w, h] = SIZE_PX;
+    let scene = json!({ "fl_x": focal_px, "fl_y": focal_px, "cx": 16.0, "cy": 12.0, "w": w, "h": h, "frames": frames });
+    std::fs::write(folder.join("transforms.json"), scene.to_string()).expect("room on the disk");
+}
+
+fn bench(folder: &Path, args: &[&str]) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
+    command.current_dir(folder).env_remove("FIELDRIG_LPIPS_WEIGHTS").arg("bench").args(args);
+    command.output().expect("fieldrig starts")
+}
+
+/// The JSON lines of a bench that succeeded.
+fn events(folder: &Path, args: &[&str]) -> Vec<Value> {
+    let output = bench(folder, args);
+    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    let stdout = String::from_utf8(output.stdout).expect("stdout is UTF-8");
+    stdout.lines().map(|line| serde_json::from_str(line).expect("a JSON object a line")).collect()
+}
+
+/// Asserts that a bench refused, and that its one sentence holds `words`.
+fn assert_refused(folder: &Path, args: &[&str], code: i32, words: &[&str]) {
+    let output = bench(folder, args);
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(code), "{args:?}: {told}");
+    assert!(words.iter().all(|word| told.contains(word)), "{args:?}: {told}");
+    assert_eq!(told.lines().filter(|line| line.starts_with("error: ")).count(), 1, "{told}");
+}
+
+fn assert_chart(folder: &Path, name: &str) {
+    let svg = std::fs::read_to_string(folder.join(format!("{name}.svg"))).expect("a drawing");
+    assert!(svg.contains("test PSNR, dB") || svg.contains("gain, dB"), "{svg}");
+    assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
+    let picture = image::open(folder.join(format!("{name}.png"))).expect("a picture").into_rgb8();
+    let n_inked = picture.pixels().filter(|pixel| pixel.0 != [255; 3]).count();
+    assert!(picture.width() > 1000 && n_inked > 10_000, "{name}: {n_inked} pixels drawn");
+}
+
+#[test]
+fn a_curve_is_drawn_with_a_peer_and_goes_on_where_it_stopped() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    scene(folder);
+    let peer =
+        json!({ "rows": [{ "seconds": 0.25, "psnr": 12.0, "n": 50 }, { "seconds": 1.0, "psnr": 26.0, "n": 90 }] });
+    std::fs::write(folder.join("other.json"), peer.to_string()).expect("room on the disk");
+    let args =
+        ["curve", ".", "--seconds", "0.6", "--seeds", "2", "--max-splats", "500", "--peer", "other.json", "--out", "c"];
+    let told = events(folder, &[&args[..], &["--json"]].concat());
+    assert_eq!(told.iter().filter(|event| event["event"] == "run").count(), 2);
+    let lines = told[2]["findings"]["lines"].as_array().expect("lines").clone();
+    assert_eq!((lines.len(), &lines[1]["label"]), (2, &json!("other")));
+    assert!(lines[0]["points"].as_array().is_some_and(|points| !points.is_empty()), "{}", lines[0]);
+    assert_eq!(lines[0]["summary"]["n_runs"], 2);
+    let reached = &lines[1]["summary"]["seconds_to"][0];
+    assert!(reached["seconds"].as_f64().is_some_and(|secs| (0.8..1.0).contains(&secs)), "{reached}");
+    assert_chart(&folder.join("c"), "curve");
+    let page = std::fs::read_to_string(folder.join("c/curve.html")).expect("a page");
+    assert!(page.contains("<svg ") && page.contains("to 28 dB"));
+
+    // What is finished is not repeated: only a removed run is done again.
+    let runs = std::fs::read_dir(folder.join("c/bench-runs")).expect("runs");
+    let first = runs.map(|run| run.expect("a run").path()).min().expect("a run");
+    std::fs::remove_file(first).expect("removed");
+    let again = events(folder, &[&args[..], &["--json"]].concat());
+    assert_eq!([&again[0]["kept"], &again[1]["kept"]], [&json!(false), &json!(true)]);
+    assert_eq!(again[1]["end"], told[1]["end"]);
+    let changed = ["curve", ".", "--seconds", "0.6", "--seeds", "2", "--max-splats", "400", "--out", "c"];
+    assert_refused(folder, &changed, 2, &["max_splats", "--out c"]);
+}
+
+#[test]
+fn a_budget_tells_the_trainers_own_choice() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    scene(folder);
+    let told = events(folder, &["budget", ".", "--steps", "20", "--splats", "200,50", "--out", "b", "--json"]);
+    let findings = &told.last().expect("events")["findings"];
+    assert!(findings["own_choice"]["psnr"].as_f64().is_some_and(f64::is_finite), "{findings}");
+    let caps: Vec<u64> = findings["caps"]
+        .as_array()
+        .expect("caps")
+        .iter()
+        .map(|capped| capped["cap"].as_u64().expect("a cap"))
+        .collect();
+    assert_eq!(caps, [50, 200]);
+    for capped in findings["caps"].as_array().expect("caps") {
+        assert!(capped["primitives"].as_f64() <= capped["cap"].as_f64(), "{capped}");
+    }
+    assert_chart(&folder.join("b"), "budget");
+    assert_chart(&folder.join("b"), "budget-gain");
+    assert_refused(folder, &["budget", ".", "--max-splats", "9"], 2, &["--max-splats", "--splats"]);
+}
+
+#[test]
+fn stability_is_the_same_again_and_clock_offsets_need_times() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    scene(folder);
+    let small = ["--steps", "20", "--max-splats", "300", "--json"];
+    let poses = ["stability", ".", "--disturb", "pose-noise", "--levels", "0,50", "--out"];
+    let measured = |out: &str| {
+        let told = events(folder, &[&poses[..], &[out], &small].concat());
+        told.last().expect("events")["findings"]["disturbances"].clone()
+    };
+    let (first, second) = (measured("s"), measured("again"));
+    let psnrs = |of: &Value| -> Vec<f64> {
+        let points = of[0]["variants"][0]["points"].as_array().expect("points");
+        points.iter().map(|point| point["psnr"].as_f64().expect("a score")).collect()
+    };
+    assert_eq!(psnrs(&first).len(), 2);
+    assert_eq!(psnrs(&first), psnrs(&second), "one seed, one result");
+    assert_ne!(psnrs(&first)[0], psnrs(&first)[1], "the noise reaches the trainer");
+    assert_chart(&folder.join("s"), "stability-pose-noise");
+
+    let clock = ["stability", ".", "--disturb", "clock-offset", "--levels", "100", "--out", "t"];
+    assert_refused(folder, &clock, 2, &["clock-offset", "--rate-hz"]);
+    let told = events(folder, &[&clock[..], &["--rate-hz", "10"], &small].concat());
+    assert_eq!(told.iter().filter(|event| event["event"] == "run").count(), 2, "undisturbed, and 100 ms");
+    let few = ["stability", ".", "--disturb", "keyframes,exposure", "--levels", "1"];
+    assert_refused(folder, &few, 2, &["--levels", "one disturbance"]);
+}
