@@ -322,13 +322,13 @@ impl CameraTerms {
         };
         let fix = |slots: &Slots| {
             let of_camera = |term| value(slots.camera, term, self.set.of_camera());
-            let drift = |slot: &u32| std::array::from_fn(|term| value(*slot, term as u32, self.set.of_image()));
+            let drift = |slot: &u32| [0, 1, 2, 3, 4, 5].map(|term| value(*slot, term, self.set.of_image()));
             CameraFix {
-                turn_rad: std::array::from_fn(|axis| of_camera(axis as u32)),
-                shift_m: std::array::from_fn(|axis| of_camera(3 + axis as u32)),
+                turn_rad: [0, 1, 2].map(of_camera),
+                shift_m: [3, 4, 5].map(of_camera),
                 delay_secs: of_camera(6),
-                log_focal: [of_camera(7), of_camera(8)],
-                principal_focals: [of_camera(9), of_camera(10)],
+                log_focal: [7, 8].map(of_camera),
+                principal_focals: [9, 10].map(of_camera),
                 drift: if self.set.image_poses {
                     slots.images.iter().map(|(stamp, slot)| (stamp.0, drift(slot))).collect()
                 } else {

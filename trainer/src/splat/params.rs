@@ -140,10 +140,10 @@ pub(crate) struct Rule {
     pub(crate) unused: u32,
 }
 
-/// Terms of a camera or of an image, as in shared/camera_terms.wgsl.
+/// Terms of a camera or of an image, as in `shared/camera_terms.wgsl`.
 pub(crate) const N_TERMS: u32 = 16;
 
-/// `Lens` of shared/camera_terms.wgsl.
+/// `Lens` of `shared/camera_terms.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct Lens {
@@ -154,7 +154,7 @@ pub(crate) struct Lens {
     pub(crate) unused: [u32; 2],
 }
 
-/// `CameraRule` of shared/camera_terms.wgsl.
+/// `CameraRule` of `shared/camera_terms.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct CameraRule {
