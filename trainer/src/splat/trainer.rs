@@ -306,6 +306,7 @@ impl SplatTrainer {
         if pending.is_empty() {
             return Ok(());
         }
+        self.measure_scene();
         let discs = self.seeder.discs(&pending, self.seeds_per_image, self.options.sh_degree);
         self.add(&discs)?;
         self.unseeded.extend(pending.into_iter().filter(|keyframe| keyframe.depth.is_none()));
@@ -343,7 +344,7 @@ impl SplatTrainer {
         let centers: Vec<_> = keyframes.iter().map(|keyframe| keyframe.world_from_camera.translation.vector).collect();
         let middle = centers.iter().sum::<nalgebra::Vector3<f64>>() / centers.len().max(1) as f64;
         let spread = centers.iter().map(|center| (center - middle).norm()).fold(0.0, f64::max);
-        let mut depths: Vec<f64> = keyframes.iter().filter_map(|keyframe| median_depth_m(keyframe)).collect();
+        let mut depths: Vec<f64> = self.views.iter().filter_map(|view| view.median_depth_m).collect();
         depths.sort_by(f64::total_cmp);
         let looks = depths.get(depths.len() / 2).copied().unwrap_or(spread);
         self.scene_size_m = (1.1 * spread).max(0.5 * looks).max(1e-3);
@@ -412,6 +413,7 @@ impl SplatTrainer {
         self.ensure_scratch(need)?;
         ensure_frame(&self.gpu, &mut self.learn_frame, &mut self.passes, size_px, true)?;
         let (lens, level) = self.views[view_ix].lens_and_level(&self.gpu, level_ix)?;
+        let lens = lens.filter(|_| self.cameras.set.any());
         let (Some((_, scratch)), Some(frame)) = (&self.scratch, &self.learn_frame) else {
             return Err(Error::DeviceLost);
         };
@@ -692,7 +694,6 @@ impl Method for SplatTrainer {
         self.schedule_start = self.schedule_start.max(self.step.saturating_sub(self.options.n_planned_steps / 2));
         self.pending.push(keyframe.clone());
         self.views.push(TrainView::new(keyframe));
-        self.measure_scene();
         Ok(())
     }
 
@@ -869,11 +870,4 @@ fn spread_out(arrays: &SplatArrays, n: usize) -> SplatArrays {
         sh: picks.iter().flat_map(|ix| arrays.sh[ix * n_coeffs..(ix + 1) * n_coeffs].iter().copied()).collect(),
         sh_degree: arrays.sh_degree,
     }
-}
-
-fn median_depth_m(keyframe: &Keyframe) -> Option<f64> {
-    let depth = keyframe.depth.as_ref()?;
-    let mut sample: Vec<f32> = depth.depth_m.iter().copied().step_by(997).filter(|z| *z > 0.0).collect();
-    sample.sort_by(f32::total_cmp);
-    sample.get(sample.len() / 2).map(|z| f64::from(*z))
 }

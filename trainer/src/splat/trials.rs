@@ -158,6 +158,7 @@ impl Trials {
         let Phase::With { instead, without_db, .. } = std::mem::replace(&mut self.phase, Phase::Waiting) else {
             return None;
         };
+        log::debug!("without {without_db:.3?}, with {with_db:.3?} dB");
         let trial = Trial::of(terms, &without_db, with_db);
         log::info!(
             "{}: {:+.2} dB on {} held-back images (standard error {:.2}): {}",

@@ -19,6 +19,8 @@ const FAR_M: f64 = 1e4;
 #[derive(Debug)]
 pub(crate) struct TrainView {
     pub(crate) keyframe: Arc<Keyframe>,
+    /// Of what its depth camera sees.
+    pub(crate) median_depth_m: Option<f64>,
     levels: [Option<Level>; 3],
     /// Where something is learned about cameras.
     lens: Option<Buffer>,
@@ -37,7 +39,7 @@ pub(crate) struct Level {
 
 impl TrainView {
     pub(crate) fn new(keyframe: Arc<Keyframe>) -> Self {
-        Self { keyframe, levels: [const { None }; 3], lens: None }
+        Self { median_depth_m: median_depth_m(&keyframe), keyframe, levels: [const { None }; 3], lens: None }
     }
 
     /// Takes part in what is learned about cameras.
@@ -105,6 +107,13 @@ impl LevelImages {
         );
         Self { camera, image, depth_m }
     }
+}
+
+fn median_depth_m(keyframe: &Keyframe) -> Option<f64> {
+    let depth = keyframe.depth.as_ref()?;
+    let mut sample: Vec<f32> = depth.depth_m.iter().copied().step_by(997).filter(|z| *z > 0.0).collect();
+    sample.sort_by(f32::total_cmp);
+    sample.get(sample.len() / 2).map(|z| f64::from(*z))
 }
 
 /// The camera that took the keyframe.
