@@ -203,6 +203,18 @@ impl CameraTerms {
         Ok(copy)
     }
 
+    /// Goes back to a copy; slots handed out since then keep their place, with nothing learned.
+    pub(crate) fn go_back(&mut self, gpu: &Gpu, (set, terms): (TermSet, Buffer)) -> Result<(), Error> {
+        self.set = set;
+        if terms.bytes() < self.used_bytes() {
+            self.terms = gpu.storage("splat.camera_terms", self.used_bytes())?; // Zeros.
+            gpu.copy((&terms, 0), (&self.terms, 0), terms.bytes());
+        } else {
+            self.terms = terms;
+        }
+        Ok(())
+    }
+
     fn take_slot(&mut self, gpu: &Gpu) -> Result<u32, Error> {
         self.n_used += 1;
         let bytes = SLOT_BYTES * u64::from(self.n_used);

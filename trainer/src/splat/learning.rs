@@ -177,6 +177,17 @@ fn a_late_keyframe_lets_the_model_grow_again() {
 }
 
 /// Black splats look like no splats before a black background, but they hide what is behind them and have a depth.
+/// Learns from many images, with the lens to be tried.
+fn trying_a_lens(keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, max_splats: u32) -> SplatTrainer {
+    let cameras = CameraChoice::Try(vec![TermSet { lens: true, ..TermSet::default() }]);
+    let options = SplatOptions { cameras, max_splats, n_planned_steps: 1500, ..options() };
+    let mut trainer = SplatTrainer::new(gpu, options).unwrap();
+    for keyframe in keyframes {
+        trainer.push(keyframe.clone()).unwrap();
+    }
+    trainer
+}
+
 /// A focal length off by 6 % is found out on the held-back images.
 #[test]
 fn a_wrong_lens_is_found_out() {
@@ -188,18 +199,28 @@ fn a_wrong_lens_is_found_out() {
         Arc::new(Keyframe { focal_px, ..keyframe.as_ref().clone() })
     });
     let wrong: Vec<_> = wrong.collect();
-    let lens = TermSet { lens: true, ..TermSet::default() };
-    let cameras = CameraChoice::Try(vec![lens]);
-    let options = SplatOptions { cameras, max_splats: 2000, n_planned_steps: 1500, ..options() };
-    let mut trainer = SplatTrainer::new(gpu, options).unwrap();
-    for keyframe in &wrong {
-        trainer.push(keyframe.clone()).unwrap();
-    }
+    let mut trainer = trying_a_lens(&wrong, gpu, 2000);
     train(&mut trainer, 900);
     let found = trainer.posed_lens(&wrong[0]).unwrap().focal_px;
     assert!(trainer.trials()[0].kept, "{:?}, focal length {found:?}", trainer.trials());
     // The cameras turn about the vertical axis only, which tells the horizontal focal length; 400 steps go half the way.
     assert!((found[0] / FOCAL_PX - 1.0).abs() < 0.6 * (OFF - 1.0), "{found:?} instead of {FOCAL_PX}");
+}
+
+#[test]
+fn what_is_being_tried_is_not_saved_and_tried_again() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = n_keyframes(&gpu, 36, true);
+    let mut trainer = trying_a_lens(&keyframes, gpu, 300);
+    train(&mut trainer, 750);
+    trainer.step(40).unwrap();
+    assert!(trainer.progress().step < 750 && !trainer.camera_fixes().unwrap().is_empty(), "a lens is being tried");
+    let folder = tempfile::tempdir().unwrap();
+    trainer.save(folder.path()).unwrap();
+    assert!(trainer.camera_fixes().unwrap().is_empty(), "nothing is decided yet, so nothing is saved");
+    assert_eq!((trainer.progress().step, trainer.trials().len()), (750, 0));
+    train(&mut trainer, 260);
+    assert_eq!(trainer.trials().len(), 1);
 }
 
 #[test]

@@ -568,13 +568,14 @@ impl SplatTrainer {
         })
     }
 
-    fn go_back(&mut self, state: State) {
+    fn go_back(&mut self, state: State) -> Result<(), Error> {
         self.passes.forget_bindings();
         (self.splats, self.step, self.grown_at) = (state.splats, state.step, state.grown_at);
-        (self.cameras.set, self.cameras.terms) = state.cameras;
+        self.cameras.go_back(&self.gpu, state.cameras)?;
         self.tell_n();
         let step = u32::try_from(self.step).unwrap_or(u32::MAX);
         self.gpu.write(&self.learn_status, 4 * status::STEP as u64, bytemuck::bytes_of(&step));
+        Ok(())
     }
 
     /// Begins, turns and ends trials of what may be learned about cameras.
@@ -593,7 +594,7 @@ impl SplatTrainer {
                 let without_db = self.score_held_back()?;
                 let state = self.state()?;
                 if let Some((from, terms)) = self.trials.turn(state, without_db) {
-                    self.go_back(from);
+                    self.go_back(from)?;
                     self.cameras.learn_also(terms);
                     self.begin_learning()?;
                 }
@@ -601,7 +602,7 @@ impl SplatTrainer {
             Due::End => {
                 let with_db = self.score_held_back()?;
                 if let Some(instead) = self.trials.end(&with_db) {
-                    self.go_back(instead);
+                    self.go_back(instead)?;
                 }
             }
             Due::Join => {
@@ -779,6 +780,11 @@ impl Method for SplatTrainer {
     }
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {
+        self.settle()?;
+        if let Some(instead) = self.trials.give_up() {
+            log::info!("training ends before what is being tried about cameras could be judged: saved without it");
+            self.go_back(instead)?;
+        }
         let arrays = self.arrays()?;
         std::fs::create_dir_all(folder).map_err(|source| Error::Write { path: folder.to_owned(), source })?;
         ply::write(&folder.join("splats.ply"), &arrays)?;

@@ -173,6 +173,17 @@ impl Trials {
         (!kept).then_some(*instead)
     }
 
+    /// Gives up a candidate that is being learned: the state to go back to. It is tried again where training goes on.
+    pub(crate) fn give_up(&mut self) -> Option<State> {
+        match std::mem::replace(&mut self.phase, Phase::Waiting) {
+            Phase::With { instead, .. } => Some(*instead),
+            other => {
+                self.phase = other;
+                None
+            }
+        }
+    }
+
     pub(crate) fn settle(&mut self) -> Vec<Arc<Keyframe>> {
         self.phase = Phase::Settled;
         std::mem::take(&mut self.held_back)
