@@ -409,9 +409,9 @@ fn findings(
         title: format!("Stability: {}", data.name),
         sentences: vec![
             format!(
-                "Each point is a model trained for {length} on disturbed images and scored on held-out images that are not                  disturbed. A break point is where the line has fallen by 1 or 3 dB from its undisturbed end."
+                "Each point is a model trained for {length} on disturbed images and scored on held-out images that are not disturbed. A break point is where the line has fallen by 1 or 3 dB from its undisturbed end."
             ),
-            "Pose noise turns each camera too, by 0.1 degrees a millimetre; poses of a clock offset are interpolated between              neighboring images; an exposure step darkens the first half of the capture and brightens the second, half each."
+            "Pose noise turns each camera too, by 0.1 degrees a millimetre; poses of a clock offset are interpolated between neighboring images; an exposure step darkens the first half of the capture and brightens the second, half each."
                 .into(),
             format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),
         ],

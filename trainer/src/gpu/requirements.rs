@@ -5,7 +5,7 @@
 pub struct Optional {
     /// Smallest number of lanes that run together, when subgroup operations may be used: 4 to 128.
     ///
-    /// Without it sorting ranks sequentially and backward lanes hand their state on through workgroup memory.
+    /// Without it sorting ranks sequentially and backward sums over its lanes through workgroup memory.
     pub subgroup_lanes: Option<u32>,
     /// GPU timestamps for per-pass times; without them only wall time is known.
     pub timestamps: bool,

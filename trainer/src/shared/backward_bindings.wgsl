@@ -1,18 +1,8 @@
 // backward_bindings: what both forms of `backward` read and write, and what they have in common.
 
-#import view
-#import model
-#import projection
-#import bins
-#import status
+#import tile
 #import gradient
 
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<storage, read> status: array<u32>;
-@group(0) @binding(2) var<storage, read> bin_starts: array<u32>;
-@group(0) @binding(3) var<storage, read> tile_bits: array<u32>;
-@group(0) @binding(4) var<storage, read> entries: array<vec4u>; // splat, tiles, slot
-@group(0) @binding(5) var<storage, read> drawn: array<Drawn>;
 @group(0) @binding(6) var<storage, read> upstream: array<vec4f>;
 @group(0) @binding(7) var<storage, read> rest: array<vec2f>;
 @group(0) @binding(8) var<storage, read> last: array<u32>;

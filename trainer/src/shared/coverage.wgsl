@@ -1,5 +1,22 @@
 // coverage: how a splat covers a lane's pixels. After `pixels`.
 
+// With one pixel's value replaced or read: indexing by a variable would put all of a lane's values into memory.
+fn put(all: Px, k: u32, value: f32) -> Px {
+    return select(all, Px(value), INDEX == PxU(k));
+}
+
+fn put_u(all: PxU, k: u32, value: u32) -> PxU {
+    return select(all, PxU(value), INDEX == PxU(k));
+}
+
+fn pick(all: Px, k: u32) -> f32 {
+    return dot(select(Px(0.0), all, INDEX == PxU(k)), Px(1.0));
+}
+
+fn pick_u(all: PxU, k: u32) -> u32 {
+    return dot(select(PxU(0u), all, INDEX == PxU(k)), PxU(1u));
+}
+
 const LN_2 = 0.6931471805599453;
 
 // A conic as the pixels need it: its quadratic form gives the falloff as a power of 2; w: the largest power drawn.

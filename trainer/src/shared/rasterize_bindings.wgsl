@@ -1,17 +1,7 @@
 // rasterize_bindings: what both forms of `rasterize` read and write.
 
-#import view
-#import model
-#import projection
-#import bins
-#import status
+#import tile
 
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<storage, read> status: array<u32>;
-@group(0) @binding(2) var<storage, read> bin_starts: array<u32>;
-@group(0) @binding(3) var<storage, read> tile_bits: array<u32>;
-@group(0) @binding(4) var<storage, read> entries: array<vec4u>; // splat, tiles, slot
-@group(0) @binding(5) var<storage, read> drawn: array<Drawn>;
 @group(0) @binding(6) var<storage, read_write> image: array<vec4f>;
 @group(0) @binding(7) var<storage, read_write> depth: array<f32>;
 @group(0) @binding(8) var<storage, read_write> last: array<u32>;

@@ -1,4 +1,17 @@
-// tile: where a tile lies, and the list of its bin. For kernels that bind view, status, bin_starts and tile_bits.
+// tile: where a tile lies, the list of its bin, and the bindings that every kernel over tiles begins with.
+
+#import view
+#import model
+#import projection
+#import bins
+#import status
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<storage, read> status: array<u32>;
+@group(0) @binding(2) var<storage, read> bin_starts: array<u32>;
+@group(0) @binding(3) var<storage, read> tile_bits: array<u32>;
+@group(0) @binding(4) var<storage, read> entries: array<vec4u>; // splat, tiles, slot
+@group(0) @binding(5) var<storage, read> drawn: array<Drawn>;
 
 struct Tile {
     in_grid: bool,

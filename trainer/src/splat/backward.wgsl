@@ -14,7 +14,6 @@
 #import backward_bindings
 #import pixels
 #import coverage
-#import tile
 #import tile_queue
 #import sums
 

@@ -12,7 +12,6 @@
 #import backward_bindings
 #import strips
 #import coverage
-#import tile
 
 const BATCH = 32u;
 // What lies around the splats at hand, between two batches.

@@ -179,6 +179,22 @@ impl SplatBuffers {
         })
     }
 
+    /// The parameters by the names that kernels bind.
+    pub(crate) fn parameters(&self) -> [(&'static str, &Buffer); 5] {
+        [
+            ("means", &self.means),
+            ("rotations", &self.rotations),
+            ("shapes", &self.shapes),
+            ("sh_dc", &self.sh_dc),
+            ("sh_rest", &self.sh_rest),
+        ]
+    }
+
+    /// The optimiser's moments, likewise.
+    pub(crate) fn all_moments(&self) -> [(&'static str, &Buffer); 3] {
+        [("moments", &self.moments), ("sh_dc_moments", &self.sh_dc_moments), ("sh_rest_moments", &self.sh_rest_moments)]
+    }
+
     /// Every per-splat buffer with its planes and bytes an entry.
     pub(crate) fn planes(&self) -> [(&Buffer, u32, u64); N_PLANED] {
         let rest = n_sh_rest(self.sh_degree);

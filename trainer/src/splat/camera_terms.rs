@@ -46,6 +46,20 @@ impl TermSet {
     }
 }
 
+impl std::fmt::Display for TermSet {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let names = [
+            (self.mount, "camera mounts"),
+            (self.delay, "delays"),
+            (self.lens, "lenses"),
+            (self.image_poses, "poses of images"),
+            (self.image_gains, "gains of images"),
+        ];
+        let names: Vec<&str> = names.into_iter().filter(|(on, _)| *on).map(|(_, name)| name).collect();
+        f.write_str(&if names.is_empty() { "nothing".to_owned() } else { names.join(", ") })
+    }
+}
+
 /// What was learned about one camera.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct CameraFix {
@@ -163,6 +177,17 @@ impl CameraTerms {
             cameras: BTreeMap::new(),
             n_used: 0,
         })
+    }
+
+    /// Learns more.
+    pub(crate) fn learn_also(&mut self, more: TermSet) {
+        self.set = TermSet {
+            mount: self.set.mount || more.mount,
+            delay: self.set.delay || more.delay,
+            lens: self.set.lens || more.lens,
+            image_poses: self.set.image_poses || more.image_poses,
+            image_gains: self.set.image_gains || more.image_gains,
+        };
     }
 
     /// The lens of a keyframe, with slots for its camera's terms and its own.

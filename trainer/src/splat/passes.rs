@@ -71,20 +71,17 @@ pub(crate) fn grow(
         &pipelines.grow_child,
         blocks(growth.n_after),
         &[
-            uniform,
-            ("cumulative", &buffers.cumulative),
-            weights,
-            ("means", &splats.means),
-            ("rotations", &splats.rotations),
-            ("shapes", &splats.shapes),
-            ("sh_dc", &splats.sh_dc),
-            ("sh_rest", &splats.sh_rest),
-            ("moments", &splats.moments),
-            ("sh_dc_moments", &splats.sh_dc_moments),
-            ("sh_rest_moments", &splats.sh_rest_moments),
-            ("n_children", &buffers.n_children),
-            ("parents", &buffers.parents),
-        ],
+            &[
+                uniform,
+                ("cumulative", &buffers.cumulative),
+                weights,
+                ("n_children", &buffers.n_children),
+                ("parents", &buffers.parents),
+            ][..],
+            &splats.parameters(),
+            &splats.all_moments(),
+        ]
+        .concat(),
     );
     passes.dispatch(
         gpu,
@@ -112,17 +109,16 @@ impl ViewPasses<'_> {
             &pipelines.project,
             n_blocks,
             &[
-                view,
-                model,
-                ("means", &splats.means),
-                ("rotations", &splats.rotations),
-                ("shapes", &splats.shapes),
-                ("sh_dc", &splats.sh_dc),
-                ("sh_rest", &splats.sh_rest),
-                ("drawn", &scratch.drawn),
-                ("depth_keys", &scratch.by_depth.keys[0]),
-                ("status", status),
-            ],
+                &[
+                    view,
+                    model,
+                    ("drawn", &scratch.drawn),
+                    ("depth_keys", &scratch.by_depth.keys[0]),
+                    ("status", status),
+                ][..],
+                &splats.parameters(),
+            ]
+            .concat(),
         );
         pipelines.sort.sort(gpu, passes, &scratch.by_depth, status);
         let by_depth = ("by_depth", &scratch.by_depth.values[0]);
@@ -263,18 +259,12 @@ impl ViewPasses<'_> {
             ("tile_counts", &scratch.tile_counts),
             ("slot_begins", &scratch.slot_begins),
             ("gradients", &scratch.gradients),
-            ("means", &splats.means),
-            ("rotations", &splats.rotations),
-            ("shapes", &splats.shapes),
-            ("sh_dc", &splats.sh_dc),
-            ("sh_rest", &splats.sh_rest),
-            ("moments", &splats.moments),
-            ("sh_dc_moments", &splats.sh_dc_moments),
-            ("sh_rest_moments", &splats.sh_rest_moments),
             ("status", status),
             ("error_sums", &splats.error_sums),
             ("drawn", &scratch.drawn),
         ];
+        buffers.extend(splats.parameters());
+        buffers.extend(splats.all_moments());
         if camera {
             buffers.push(("camera_sums", &scratch.camera_sums));
         }

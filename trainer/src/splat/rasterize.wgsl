@@ -10,7 +10,6 @@
 #import rasterize_bindings
 #import pixels
 #import coverage
-#import tile
 #import tile_queue
 
 var<workgroup> wg_tile: Tile;

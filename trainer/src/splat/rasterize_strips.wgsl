@@ -9,7 +9,6 @@
 #import rasterize_bindings
 #import strips
 #import coverage
-#import tile
 
 var<workgroup> wg_blends: array<Blend, 64>; // [N_STRIPS, LANES], between two queues
 

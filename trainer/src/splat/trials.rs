@@ -4,7 +4,7 @@
 //! the same state; it stays when the paired gain on the selection keyframes exceeds both [`LEAST_GAIN_DB`] and two
 //! standard errors. When all are settled the selection keyframes are learned from, too.
 
-use super::camera_terms::{CameraTerms, TermSet};
+use super::camera_terms::TermSet;
 use super::trainer::State;
 use crate::Keyframe;
 use std::collections::VecDeque;
@@ -212,33 +212,6 @@ impl Trials {
     /// Forgets a keyframe.
     pub(crate) fn remove(&mut self, gone: impl Fn(&Keyframe) -> bool) {
         self.held_back.retain(|keyframe| !gone(keyframe));
-    }
-}
-
-impl std::fmt::Display for TermSet {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let names = [
-            (self.mount, "camera mounts"),
-            (self.delay, "delays"),
-            (self.lens, "lenses"),
-            (self.image_poses, "poses of images"),
-            (self.image_gains, "gains of images"),
-        ];
-        let names: Vec<&str> = names.into_iter().filter(|(on, _)| *on).map(|(_, name)| name).collect();
-        f.write_str(&if names.is_empty() { "nothing".to_owned() } else { names.join(", ") })
-    }
-}
-
-impl CameraTerms {
-    /// Learns more.
-    pub(crate) fn learn_also(&mut self, more: TermSet) {
-        self.set = TermSet {
-            mount: self.set.mount || more.mount,
-            delay: self.set.delay || more.delay,
-            lens: self.set.lens || more.lens,
-            image_poses: self.set.image_poses || more.image_poses,
-            image_gains: self.set.image_gains || more.image_gains,
-        };
     }
 }
 
