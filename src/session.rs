@@ -1,5 +1,6 @@
 //! One model in training: its test keyframes, its clock, and what is told of it.
 
+use crate::bench::statistics::median;
 use crate::checkpoints::Checkpoints;
 use crate::evaluate::{Evaluator, ImageScores, Scores};
 use crate::marks::Marks;
@@ -10,9 +11,11 @@ use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::gpu::Gpu;
-use trainer::{Keyframe, Method, Progress, Split};
+use trainer::gpu::{Gpu, PassTiming};
+use trainer::{Keyframe, Method, Part, Progress, Split};
 
+/// Steps that a profile is the median of.
+const N_PROFILED: usize = 21;
 /// Points of the PSNR curve that are kept; past them every second one goes.
 const MAX_HISTORY: usize = 512;
 
@@ -74,6 +77,7 @@ pub(crate) struct Session {
     /// Newest PSNR of each test keyframe, by camera and stamp.
     newest_psnr: BTreeMap<(String, i64), f64>,
     tell: Tell,
+    profiles: bool,
     bar: ProgressBar,
 }
 
@@ -134,6 +138,13 @@ struct Done<'a> {
     checkpoint_sha256: &'a str,
 }
 
+/// GPU time of each kernel in a step, milliseconds.
+#[derive(Debug, Serialize)]
+struct Profile<'a> {
+    event: &'static str,
+    passes: &'a [(&'static str, f64)],
+}
+
 /// What `report.json` holds.
 #[derive(Debug, Serialize)]
 struct Report<'a, T: Serialize> {
@@ -141,6 +152,10 @@ struct Report<'a, T: Serialize> {
     adapter: String,
     #[serde(flatten)]
     particulars: &'a T,
+    /// What the parts of the model that were tried bought.
+    parts: Vec<Part>,
+    /// GPU time of each pass of a step, milliseconds, where it was asked for.
+    passes: Vec<(&'static str, f64)>,
     marks: &'a [Eval],
     per_image: &'a [ImageScores],
 }
@@ -171,6 +186,7 @@ impl Session {
             history: Vec::new(),
             newest_psnr: BTreeMap::new(),
             tell,
+            profiles: false,
             bar: print::bar(length, template, matches!(tell, Tell::Json | Tell::Nothing)),
         }
     }
@@ -178,6 +194,11 @@ impl Session {
     /// Writes checkpoints, if any, from now on.
     pub(crate) fn with_checkpoints(self, checkpoints: Option<Checkpoints>) -> Self {
         Self { checkpoints, ..self }
+    }
+
+    /// Tells at the end what each pass of a step takes, if asked to.
+    pub(crate) fn with_profile(self, profiles: bool) -> Self {
+        Self { profiles, ..self }
     }
 
     /// Goes on where earlier runs had trained for so long; marks they reached are not told again.
@@ -287,10 +308,13 @@ impl Session {
             out,
             checkpoint_sha256: &checkpoint_sha256,
         };
+        let passes = if self.profiles { self.profile()? } else { Vec::new() };
         let report = Report {
             done: &done,
             adapter: self.gpu.describe(),
             particulars,
+            parts: self.method.report(),
+            passes,
             marks: &outcome.marks,
             per_image: &outcome.per_image,
         };
@@ -298,11 +322,17 @@ impl Session {
         let last_checkpoint = self.checkpoints.as_mut().map_or(Ok(()), Checkpoints::wait);
         match self.tell {
             Tell::Json => {
+                if self.profiles {
+                    print::json(&Profile { event: "profile", passes: &report.passes })?;
+                }
                 print::json(&done)?;
                 return last_checkpoint;
             }
             Tell::Bar | Tell::Nothing => return last_checkpoint,
             Tell::Lines => {}
+        }
+        for (name, millis) in &report.passes {
+            print::line(format_args!("{millis:9.3} ms  {name}"))?;
         }
         print::line(format_args!(
             "{seconds:.1} s, {}, {}, {:.1} MB: {}",
@@ -313,6 +343,23 @@ impl Session {
         ))?;
         print::line(format_args!("saved in {}", out.display()))?;
         last_checkpoint
+    }
+
+    /// GPU time of each kernel in a step, milliseconds: medians over [`N_PROFILED`] steps, in the order of the first.
+    fn profile(&mut self) -> anyhow::Result<Vec<(&'static str, f64)>> {
+        let mut names: Vec<&'static str> = Vec::new();
+        let mut by_name: BTreeMap<&'static str, Vec<f64>> = BTreeMap::new();
+        for _ in 0..N_PROFILED {
+            let mut sums: BTreeMap<&'static str, f64> = BTreeMap::new();
+            for PassTiming { name, millis } in self.method.profile_step()? {
+                *sums.entry(name).or_default() += millis;
+                if !names.contains(&name) {
+                    names.push(name);
+                }
+            }
+            sums.into_iter().for_each(|(name, millis)| by_name.entry(name).or_default().push(millis));
+        }
+        Ok(names.into_iter().filter_map(|name| Some((name, median(by_name.get(name)?)?))).collect())
     }
 
     /// Scores the model a last time, and saves nothing.

@@ -6,7 +6,7 @@ use crate::exit::BadArgument;
 use crate::method::{self, Kind};
 use crate::session::{Evaluators, Limits, Session, Tell};
 use crate::stop::Stop;
-use crate::training_args::{Refine, TrainingArgs};
+use crate::training_args::{HowMany, Refine, TrainingArgs};
 use std::sync::Arc;
 use std::time::Instant;
 use trainer::Keyframe;
@@ -52,8 +52,9 @@ pub(crate) fn model(
 ) -> Result<(Kind, SplatOptions), BadArgument> {
     // A trial takes hundreds of steps more: on a processor that is minutes.
     let cameras = args.cameras(data.rig.is_some(), if software { Refine::None } else { Refine::Auto })?;
+    let count = args.count(if software { HowMany::ToCap } else { HowMany::Tested });
     if let Some(rig) = &data.rig {
-        return Ok((Kind::of_rig(rig)?, SplatOptions { cameras, ..method::options(&rig.train, steps)? }));
+        return Ok((Kind::of_rig(rig)?, SplatOptions { cameras, count, ..method::options(&rig.train, steps)? }));
     }
     let usual = SplatOptions::default();
     let options = SplatOptions {
@@ -61,6 +62,7 @@ pub(crate) fn model(
         max_splats: args.max_splats.map_or(usual.max_splats, |n| n.try_into().unwrap_or(u32::MAX)),
         max_bytes: args.max_bytes,
         cameras,
+        count,
         n_planned_steps: steps.unwrap_or(usual.n_planned_steps),
         ..usual
     };

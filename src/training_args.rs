@@ -4,7 +4,7 @@ use crate::config::{MAX_BYTES, MAX_SPLATS, Override, SEED};
 use crate::exit::BadArgument;
 use crate::method::Kind;
 use clap::value_parser;
-use trainer::splat::{CameraChoice, TermSet};
+use trainer::splat::{CameraChoice, CountChoice, TermSet};
 
 /// What to train, and how large it may become.
 #[derive(Clone, Debug, clap::Args)]
@@ -25,6 +25,17 @@ pub(crate) struct TrainingArgs {
     /// delay, lens, image-poses and image-gains, separated by commas [default: none; for data on disk auto on a GPU]
     #[arg(long, value_name = "TERMS", value_delimiter = ',', hide_possible_values = true)]
     pub(crate) refine: Vec<Refine>,
+    /// How many splats there are in the end: tested (grown up to --max-splats, then halved as long as that costs less than
+    /// 0.1 dB on held-back images) or to-cap (--max-splats) [default: to-cap; for data on disk tested on a GPU]
+    #[arg(long, value_name = "HOW", hide_possible_values = true)]
+    pub(crate) count: Option<HowMany>,
+}
+
+/// What `--count` takes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub(crate) enum HowMany {
+    Tested,
+    ToCap,
 }
 
 /// What `--refine` takes.
@@ -64,6 +75,14 @@ impl TrainingArgs {
             image_poses: has(Refine::ImagePoses),
             image_gains: has(Refine::ImageGains),
         }))
+    }
+
+    /// How the number of splats is found; `usual` where no flag says.
+    pub(crate) fn count(&self, usual: HowMany) -> CountChoice {
+        match self.count.unwrap_or(usual) {
+            HowMany::Tested => CountChoice::Tested,
+            HowMany::ToCap => CountChoice::ToCap,
+        }
     }
 
     /// The keys of the rig file that the flags stand for.

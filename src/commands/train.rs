@@ -27,7 +27,7 @@ pub(crate) struct Args {
     #[command(flatten)]
     training: TrainingArgs,
     /// Go on from the checkpoint that an earlier run left in this folder, with the same data and its settings
-    #[arg(long, value_name = "FOLDER", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "plan_steps"])]
+    #[arg(long, value_name = "FOLDER", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "count", "plan_steps"])]
     resume: Option<PathBuf>,
     /// Stop after S seconds of training, those before --resume included; loading and scoring do not count [default: 120, unless --steps is given]
     #[arg(long, value_name = "S")]
@@ -48,6 +48,9 @@ pub(crate) struct Args {
     out: Option<PathBuf>,
     #[command(flatten)]
     checkpoints: CheckpointArgs,
+    /// Tell at the end what each kernel of a step takes on the GPU
+    #[arg(long)]
+    profile: bool,
     /// Print one JSON object a line
     #[arg(long)]
     json: bool,
@@ -97,6 +100,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
     let session = Session::new(gpu, method, evaluators, limits, Tell::of_command(args.json))
         .with_checkpoints(Checkpoints::new(&out, args.checkpoints))
+        .with_profile(args.profile)
         .going_on_after(checkpoint.map_or(0.0, |checkpoint| checkpoint.seconds));
     let session = training::drive(session, &rest, &stop)?;
 

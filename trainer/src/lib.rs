@@ -18,5 +18,5 @@ pub mod spz;
 
 pub use error::Error;
 pub use keyframe::{DepthMap, Keyframe, Split, Truth};
-pub use method::{Method, Progress};
+pub use method::{Method, Part, Progress};
 pub use request::{Aabb, Picture, Projection, RenderRequest, Shutter};

@@ -1,6 +1,7 @@
 //! What every scene model can do.
 
 use crate::checkpoint::PendingCheckpoint;
+use crate::gpu::PassTiming;
 use crate::splat::PosedLens;
 use crate::{Error, Keyframe, Picture, RenderRequest};
 use kinematics::Stamp;
@@ -18,6 +19,21 @@ pub struct Progress {
     pub bytes: u64,
     /// GPU time of a step, milliseconds, smoothed.
     pub step_millis: f64,
+}
+
+/// What a part of the model was found to be worth, on images held back for it.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+pub struct Part {
+    /// What it is, in words.
+    pub part: String,
+    /// Mean PSNR with it less that without it, dB.
+    pub bought_db: f64,
+    /// Standard error of the mean, dB.
+    pub standard_error_db: f64,
+    /// Images it was measured on.
+    pub n_images: usize,
+    /// Whether the model has it.
+    pub kept: bool,
 }
 
 /// One scene model that learns from keyframes.
@@ -39,8 +55,12 @@ pub trait Method {
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error>;
     /// The camera of a keyframe as the model has it: with what was learned about all its images, not about this one.
     fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error>;
+    /// Takes one step with a timestamp around every pass; empty where the adapter has none.
+    fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error>;
     /// Where training stands.
     fn progress(&self) -> Progress;
+    /// What the parts of the model that were tried bought, in the order of the trials.
+    fn report(&self) -> Vec<Part>;
     /// Writes the model into a folder.
     fn save(&mut self, folder: &Path) -> Result<(), Error>;
     /// Takes all that training needs to go on from here; what is learned afterwards does not change it.

@@ -9,7 +9,7 @@ use crate::training;
 use serde::Serialize;
 use std::collections::HashSet;
 use std::path::PathBuf;
-use trainer::splat::SplatOptions;
+use trainer::splat::{CountChoice, SplatOptions};
 
 /// Length of a run where no flag says.
 const USUAL_SECONDS: f64 = 60.0;
@@ -69,8 +69,10 @@ struct Gain {
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let limits = training::limits(args.seconds, args.steps, USUAL_SECONDS)?;
-    if args.bench.training.max_splats.is_some() {
-        return Err(BadArgument("--max-splats: this bench sets the cap itself, name caps with --splats".into()).into());
+    if args.bench.training.max_splats.is_some() || args.bench.training.count.is_some() {
+        return Err(
+            BadArgument("--max-splats, --count: this bench sets them itself, name caps with --splats".into()).into()
+        );
     }
     let mut caps: Vec<Option<u32>> = args.splats.iter().copied().map(Some).collect();
     caps.sort_unstable();
@@ -86,11 +88,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         let mut finished = Vec::new();
         let cap_name = cap.map_or_else(|| "no cap".to_owned(), |cap| format!("cap {cap}"));
         for seed in data.options.seed..data.options.seed.saturating_add(args.seeds) {
-            let max_splats = cap.unwrap_or(SplatOptions::default().max_splats);
+            let (max_splats, count) = match cap {
+                Some(cap) => (cap, CountChoice::ToCap),
+                None => (data.options.max_splats, CountChoice::Tested),
+            };
             finished.push(runs.run(Job {
                 name: format!("budget {} {cap_name} seed {seed}", data.name),
                 data: &data,
-                options: SplatOptions { seed, max_splats, ..data.options.clone() },
+                options: SplatOptions { seed, max_splats, count, ..data.options.clone() },
                 limits,
                 disturbed: None,
                 variant: None,
@@ -198,8 +203,9 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -
         sentences: vec![
             format!(
                 "Each point is a model trained for {length} under a cap on its splats and scored on held-out images; \
-                 the run without a cap shows what the trainer takes by itself (at most {}).",
-                SplatOptions::default().max_splats
+                 the run without a cap shows what the trainer takes by itself (at most {}): halved as long as \
+                 that costs less than {PAYS_DB} dB on images held back for it.",
+                data.options.max_splats
             ),
             format!("A doubling of the splats that gains less than {PAYS_DB} dB does not pay."),
             format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),

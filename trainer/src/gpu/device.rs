@@ -157,6 +157,13 @@ impl Gpu {
         }
     }
 
+    /// Fills part of a buffer with zeros at once.
+    pub fn clear(&self, buffer: &Buffer, offset_bytes: u64, bytes: u64) {
+        let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        encoder.clear_buffer(&buffer.raw, offset_bytes, Some(bytes));
+        self.queue.submit([encoder.finish()]);
+    }
+
     /// Copies `bytes` bytes from one buffer to another at once.
     pub fn copy(&self, from: (&Buffer, u64), to: (&Buffer, u64), bytes: u64) {
         let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());

@@ -69,12 +69,12 @@ impl SplatBuffers {
         self.planes().iter().map(|(buffer, _, _)| buffer.bytes()).sum()
     }
 
-    /// A copy with more room; the moments come along.
-    pub(crate) fn grown(&self, gpu: &Gpu, capacity: u32) -> Result<Self, Error> {
-        let mut larger = Self::new(gpu, capacity, self.sh_degree)?;
+    /// A copy with room for `capacity` splats of `sh_degree`; the moments come along.
+    pub(crate) fn reshaped(&self, gpu: &Gpu, capacity: u32, sh_degree: u32) -> Result<Self, Error> {
+        let mut larger = Self::new(gpu, capacity, sh_degree)?;
         let (stride_from, stride_to) = (u64::from(self.capacity), u64::from(larger.capacity));
-        for ((from, n_planes, bytes), (to, _, _)) in self.planes().iter().zip(larger.planes()) {
-            for plane in 0..u64::from(*n_planes) {
+        for ((from, n_planes, bytes), (to, n_planes_to, _)) in self.planes().iter().zip(larger.planes()) {
+            for plane in 0..u64::from(*n_planes.min(&n_planes_to)) {
                 gpu.copy(
                     (from, plane * stride_from * bytes),
                     (to, plane * stride_to * bytes),
@@ -82,7 +82,7 @@ impl SplatBuffers {
                 );
             }
         }
-        larger.active_degree = self.active_degree;
+        larger.active_degree = self.active_degree.min(sh_degree);
         larger.set_n(gpu, self.n_splats);
         Ok(larger)
     }
@@ -135,11 +135,12 @@ impl SplatBuffers {
             gpu.write(&self.sh_dc, 4 * (channel as u64 * stride + first), bytemuck::cast_slice(&plane(0, channel)));
         }
         for ix in 0..n_sh_rest(self.sh_degree) as usize {
-            gpu.write(
-                &self.sh_rest,
-                4 * (ix as u64 * stride + first),
-                bytemuck::cast_slice(&plane(1 + ix / 3, ix % 3)),
-            );
+            let at = 4 * (ix as u64 * stride + first);
+            if 1 + ix / 3 < n_coeffs {
+                gpu.write(&self.sh_rest, at, bytemuck::cast_slice(&plane(1 + ix / 3, ix % 3)));
+            } else {
+                gpu.clear(&self.sh_rest, at, 4 * n_new as u64);
+            }
         }
         let n_new = u32::try_from(n_new).expect("the caller has made room for u32 many");
         self.set_n(gpu, self.n_splats + n_new);
@@ -283,6 +284,7 @@ pub(crate) struct Frame {
     pub(crate) last: Buffer,
     pub(crate) pixels: Buffer,
     pub(crate) depths: Buffer,
+    pub(crate) squares: Buffer,
     pub(crate) slopes: Buffer,
     pub(crate) upstream: Buffer,
     pub(crate) rest: Buffer,
@@ -303,6 +305,7 @@ impl Frame {
             last: each("splat.last", 4)?,
             pixels: each("splat.pixels", 4)?,
             depths: each("splat.depths", 4)?,
+            squares: gpu.storage("splat.squares", 8 * u64::from(n_pixels.div_ceil(256)))?,
             slopes: slope("splat.slopes", 36)?,
             upstream: slope("splat.upstream", 16)?,
             rest: slope("splat.rest", 8)?,

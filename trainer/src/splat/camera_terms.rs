@@ -347,26 +347,25 @@ impl CameraTerms {
         Ok(())
     }
 
-    /// What was learned about each camera.
-    pub(crate) fn fixes(&self, gpu: &Gpu) -> Result<BTreeMap<String, CameraFix>, Error> {
-        if !self.set.any() {
-            return Ok(BTreeMap::new());
-        }
-        let terms: Vec<[f32; 4]> = gpu.read(&self.terms, (self.n_used * N_TERMS) as usize)?;
+    /// What the terms, or a copy of them, tell about each camera.
+    pub(crate) fn fixes(&self, gpu: &Gpu, set: TermSet, terms: &Buffer) -> Result<BTreeMap<String, CameraFix>, Error> {
+        // A copy may be older than the last slots.
+        let mut terms: Vec<[f32; 4]> = gpu.read(terms, (self.used_bytes().min(terms.bytes()) / 16) as usize)?;
+        terms.resize((self.n_used * N_TERMS) as usize, [0.0; 4]);
         let value = |slot: u32, term: u32, learned: u32| {
             let on = learned & (1 << term) != 0;
             if on { f64::from(terms[(slot * N_TERMS + term) as usize][0]) } else { 0.0 }
         };
         let fix = |slots: &Slots| {
-            let of_camera = |term| value(slots.camera, term, self.set.of_camera());
-            let drift = |slot: &u32| [0, 1, 2, 3, 4, 5].map(|term| value(*slot, term, self.set.of_image()));
+            let of_camera = |term| value(slots.camera, term, set.of_camera());
+            let drift = |slot: &u32| [0, 1, 2, 3, 4, 5].map(|term| value(*slot, term, set.of_image()));
             CameraFix {
                 turn_rad: [0, 1, 2].map(of_camera),
                 shift_m: [3, 4, 5].map(of_camera),
                 delay_secs: of_camera(6),
                 log_focal: [7, 8].map(of_camera),
                 principal_focals: [9, 10].map(of_camera),
-                drift: if self.set.image_poses {
+                drift: if set.image_poses {
                     slots.images.iter().map(|(stamp, slot)| (stamp.0, drift(slot))).collect()
                 } else {
                     BTreeMap::new()

@@ -134,7 +134,7 @@ fn growth_matches_the_twin() {
     let errors: Vec<f32> = (0..N_BEFORE).map(|_| f32_of(random.uniform(0.0, 1.0).powi(8))).collect();
     let mut bench = Bench::new(&GpuOptions::default(), &scene::tilted_view(), &arrays_of(&splats));
     let gpu = bench.gpu.clone();
-    bench.splats = bench.splats.grown(&gpu, N_AFTER).unwrap();
+    bench.splats = bench.splats.reshaped(&gpu, N_AFTER, bench.splats.sh_degree).unwrap();
     let growth = Growth {
         n_before: N_BEFORE,
         n_after: N_AFTER,

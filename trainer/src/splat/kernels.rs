@@ -136,6 +136,9 @@ pub const KERNELS: &[Kernel] = &[
     kernel!("grow_scan"),
     kernel!("grow_child"),
     kernel!("grow_family"),
+    kernel!("score"),
+    kernel!("contribute"),
+    kernel!("gather"),
 ];
 
 /// What drawing needs.
@@ -186,6 +189,9 @@ pub(crate) struct LearnPipelines {
     pub(crate) grow_scan: Pipeline,
     pub(crate) grow_child: Pipeline,
     pub(crate) grow_family: Pipeline,
+    pub(crate) score: Pipeline,
+    pub(crate) contribute: Pipeline,
+    pub(crate) gather: Pipeline,
 }
 
 impl LearnPipelines {
@@ -206,6 +212,9 @@ impl LearnPipelines {
             grow_scan: Pipeline::new(gpu, kernel!("grow_scan"), &[])?,
             grow_child: Pipeline::new(gpu, kernel!("grow_child"), &[])?,
             grow_family: Pipeline::new(gpu, kernel!("grow_family"), &[])?,
+            score: Pipeline::new(gpu, kernel!("score"), &[])?,
+            contribute: Pipeline::new(gpu, kernel!("contribute"), &[])?,
+            gather: Pipeline::new(gpu, kernel!("gather"), &[])?,
         })
     }
 
@@ -252,7 +261,7 @@ mod tests {
 
     #[test]
     fn structs_have_the_same_fields_in_rust_and_wgsl() {
-        use crate::splat::params::{CameraRule, Capacity, Growth, Lens, Model, Rule, Supervision, View};
+        use crate::splat::params::{CameraRule, Capacity, Gathering, Growth, Lens, Model, Rule, Supervision, View};
         assert_layout!(
             View,
             [
@@ -305,6 +314,7 @@ mod tests {
             [of_camera, of_image, turn_rate, shift_rate_m, delay_rate, focal_rate, gain_rate, image_pull]
         );
         assert_layout!(Capacity, [n_entries, n_slots, unused]);
+        assert_layout!(Gathering, [n_kept, n_planes, words, from_capacity, to_capacity]);
     }
 
     #[test]

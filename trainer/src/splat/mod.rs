@@ -27,4 +27,4 @@ mod views;
 pub use camera_terms::{CameraFix, PosedLens, TermSet};
 pub use options::SplatOptions;
 pub use trainer::SplatTrainer;
-pub use trials::{CameraChoice, Trial};
+pub use trials::{CameraChoice, Candidate, CountChoice, Trial};

@@ -1,6 +1,6 @@
 //! How a splat model learns.
 
-use super::trials::CameraChoice;
+use super::trials::{CameraChoice, CountChoice};
 use serde::{Deserialize, Serialize};
 
 /// Settings of a [`super::SplatTrainer`].
@@ -11,6 +11,8 @@ pub struct SplatOptions {
     pub seed: u64,
     /// Most splats the model may have.
     pub max_splats: u32,
+    /// How many it takes.
+    pub count: CountChoice,
     /// Most bytes of GPU memory the model (parameters and the optimiser's moments) may take.
     pub max_bytes: Option<u64>,
     /// Highest degree of spherical harmonics, 0 to 3.
@@ -35,6 +37,7 @@ impl Default for SplatOptions {
         Self {
             seed: 0,
             max_splats: 400_000,
+            count: CountChoice::default(),
             max_bytes: None,
             sh_degree: 3,
             n_planned_steps: 7000,

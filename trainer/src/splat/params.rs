@@ -205,3 +205,14 @@ pub(crate) struct Growth {
     pub(crate) least_opacity: f32,
     pub(crate) unused: f32,
 }
+
+/// `Gathering` of gather.wgsl: which entries are copied from where to where.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct Gathering {
+    pub(crate) n_kept: u32,
+    pub(crate) n_planes: u32,
+    pub(crate) words: u32,
+    pub(crate) from_capacity: u32,
+    pub(crate) to_capacity: u32,
+}

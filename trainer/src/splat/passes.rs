@@ -248,6 +248,20 @@ impl ViewPasses<'_> {
         );
     }
 
+    /// After [`ViewPasses::backward`] of an error of one everywhere: adds what each splat is worth to the picture.
+    pub(crate) fn contribute(&self, passes: &mut Passes, pipelines: &LearnPipelines, contributions: &Buffer) {
+        let buffers = [
+            ("model", &self.splats.model),
+            ("status", self.status),
+            ("tile_counts", &self.scratch.tile_counts),
+            ("slot_begins", &self.scratch.slot_begins),
+            ("gradients", &self.scratch.gradients),
+            ("contributions", contributions),
+        ];
+        let n_blocks = self.splats.n_splats.div_ceil(BLOCK);
+        passes.dispatch(self.gpu, &pipelines.contribute, n_blocks.into(), &buffers);
+    }
+
     /// Carries the slopes from the intersections to the parameters and takes the optimiser's step; with `camera`, the
     /// kernel that also sums the slopes towards the camera.
     pub(crate) fn update(&self, passes: &mut Passes, update: &Pipeline, rule: &Buffer, camera: bool) {

@@ -42,17 +42,34 @@ struct Disc {
     color: [f64; 3],
 }
 
+/// How many discs an image is given where it is all new.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Density {
+    /// At most.
+    pub(crate) n_most: f64,
+    /// Pixels of one at least.
+    pub(crate) px_each: f64,
+}
+
+impl Density {
+    /// Between two of them, whole pixels.
+    fn stride_px(self, size_px: [u32; 2]) -> f64 {
+        let n_pixels = f64::from(size_px[0]) * f64::from(size_px[1]);
+        (n_pixels / self.n_most).max(self.px_each).sqrt().round().max(1.0)
+    }
+}
+
 impl Seeder {
     /// Discs for what these keyframes see in their depth and nobody has seen at this fineness; those without depth ask for
     /// none.
     ///
     /// The keyframes come in waves: each looks for what no earlier wave has covered, all at once; then they take their
     /// places one after the other, so that the result does not depend on how many processors there are.
-    pub(crate) fn discs(&mut self, keyframes: &[Arc<Keyframe>], n_most: f64, sh_degree: u32) -> SplatArrays {
+    pub(crate) fn discs(&mut self, keyframes: &[Arc<Keyframe>], density: Density) -> SplatArrays {
         const WAVE: usize = 32;
-        let mut seeds = Seeds::new(sh_degree);
+        let mut seeds = Seeds::new();
         for wave in keyframes.chunks(WAVE) {
-            let asked: Vec<Vec<Disc>> = wave.par_iter().map(|keyframe| self.asked(keyframe, n_most)).collect();
+            let asked: Vec<Vec<Disc>> = wave.par_iter().map(|keyframe| self.asked(keyframe, density)).collect();
             for disc in asked.into_iter().flatten() {
                 if self.take(&disc.place, disc.spacing_m) {
                     seeds.push(&disc.place, &disc.normal, disc.size_m, SEED_OPACITY, disc.color);
@@ -63,11 +80,11 @@ impl Seeder {
     }
 
     /// What one keyframe asks for where nobody has taken the place yet.
-    fn asked(&self, keyframe: &Keyframe, n_most: f64) -> Vec<Disc> {
+    fn asked(&self, keyframe: &Keyframe, density: Density) -> Vec<Disc> {
         let Some(depth) = &keyframe.depth else { return Vec::new() };
         let mut discs = Vec::new();
         let [width, height] = depth.size_px;
-        let stride = ((f64::from(width) * f64::from(height) / n_most).sqrt().round() as u32).max(1);
+        let stride = density.stride_px(depth.size_px) as u32;
         let at = |x: u32, y: u32| f64::from(depth.depth_m[(y * width + x) as usize]);
         for y in (stride / 2..height).step_by(stride as usize) {
             for x in (stride / 2..width).step_by(stride as usize) {
@@ -109,16 +126,10 @@ impl Seeder {
     }
 
     /// Discs for what a keyframe without depth sees and no disc covers, as far away as the discs around it in the image.
-    pub(crate) fn discs_without_depth(
-        &mut self,
-        keyframe: &Keyframe,
-        n_most: f64,
-        default_m: f64,
-        sh_degree: u32,
-    ) -> SplatArrays {
-        let mut seeds = Seeds::new(sh_degree);
+    pub(crate) fn discs_without_depth(&mut self, keyframe: &Keyframe, density: Density, default_m: f64) -> SplatArrays {
+        let mut seeds = Seeds::new();
         let [width, height] = keyframe.size_px.map(f64::from);
-        let stride = (width * height / n_most).sqrt().round().max(1.0);
+        let stride = density.stride_px(keyframe.size_px);
         let n_cells = [width, height].map(|px| (px / stride).ceil() as usize);
         let camera_from_world = keyframe.world_from_camera.inverse();
         let mut seen = InverseDepths::new(n_cells);
@@ -265,8 +276,8 @@ impl InverseDepths {
 }
 
 /// A cloud along the rays of all keyframes, densest around the point that the cameras look at together.
-pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize, sh_degree: u32) -> SplatArrays {
-    let mut seeds = Seeds::new(sh_degree);
+pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> SplatArrays {
+    let mut seeds = Seeds::new();
     let focus = common_focus(keyframes);
     let mut random = Random(seed ^ 0x5eed_5eed);
     let n = N_RANDOM.min(n_max);
@@ -334,15 +345,12 @@ fn unproject(depth: &DepthMap, x: u32, y: u32, z: f64) -> Vector3<f64> {
 
 struct Seeds {
     arrays: SplatArrays,
-    n_rest: usize,
 }
 
 impl Seeds {
-    fn new(sh_degree: u32) -> Self {
-        Self {
-            arrays: SplatArrays { sh_degree, ..SplatArrays::default() },
-            n_rest: ((sh_degree + 1) * (sh_degree + 1) - 1) as usize,
-        }
+    /// Their colors are the same in every direction.
+    fn new() -> Self {
+        Self { arrays: SplatArrays { sh_degree: 0, ..SplatArrays::default() } }
     }
 
     fn push(&mut self, place: &Point3<f64>, normal: &Vector3<f64>, size_m: [f64; 3], opacity: f64, color: [f64; 3]) {
@@ -355,7 +363,6 @@ impl Seeds {
         arrays.rotations_wxyz.push(f32s_of([rotation.w, rotation.i, rotation.j, rotation.k]));
         arrays.opacity_logits.push(f32_of((opacity / (1.0 - opacity)).ln()));
         arrays.sh.push(f32s_of(color.map(|value| (value - 0.5) / SH_0)));
-        arrays.sh.extend(std::iter::repeat_n([0.0; 3], self.n_rest));
     }
 }
 
@@ -378,6 +385,7 @@ mod tests {
     use kinematics::{Stamp, Transform};
 
     const WALL_M: f64 = 2.0;
+    const DENSE: Density = Density { n_most: 2000.0, px_each: 1.0 };
 
     /// A grey wall ahead; the camera's image is `size_px` wide and high, its axis in the middle.
     fn sees_wall(size_px: [u32; 2], with_depth: bool) -> Keyframe {
@@ -406,12 +414,10 @@ mod tests {
     fn many_keyframes_at_once_get_what_they_get_one_by_one() {
         let keyframes: Vec<Arc<Keyframe>> =
             (0..40).map(|ix| Arc::new(sees_wall([100 + 8 * (ix % 7), 80 + 4 * (ix % 5)], true))).collect();
-        let at_once = Seeder::default().discs(&keyframes, 2000.0, 0);
+        let at_once = Seeder::default().discs(&keyframes, DENSE);
         let mut seeder = Seeder::default();
-        let one_by_one: Vec<[f32; 3]> = keyframes
-            .iter()
-            .flat_map(|keyframe| seeder.discs(std::slice::from_ref(keyframe), 2000.0, 0).means)
-            .collect();
+        let one_by_one: Vec<[f32; 3]> =
+            keyframes.iter().flat_map(|keyframe| seeder.discs(std::slice::from_ref(keyframe), DENSE).means).collect();
         assert!(at_once.means.len() > 1500, "{} discs", at_once.means.len());
         assert_eq!(at_once.means, one_by_one);
     }
@@ -420,22 +426,29 @@ mod tests {
     fn a_camera_without_depth_gets_discs_where_the_others_left_it_bare() {
         let mut seeder = Seeder::default();
         let near = sees_wall([100, 80], true);
-        let seen = seeder.discs(&[Arc::new(near)], 2000.0, 0);
+        let seen = seeder.discs(&[Arc::new(near)], DENSE);
         assert!(seen.means.len() > 1000);
         let wide = sees_wall([200, 80], false);
-        let bare = seeder.discs_without_depth(&wide, 4000.0, 7.0, 0);
+        let bare = seeder.discs_without_depth(&wide, Density { n_most: 4000.0, px_each: 1.0 }, 7.0);
         // Half of the wide image is bare, but for a rim of a cell or two.
         assert!((1500..=2100).contains(&bare.means.len()), "{} discs", bare.means.len());
         for mean in &bare.means {
             assert!((f64::from(mean[2]) - WALL_M).abs() < 1e-3, "as far away as the wall around: {mean:?}");
             assert!(f64::from(mean[0]).abs() > 0.9, "outside of what the camera with depth saw: {mean:?}");
         }
-        assert!(seeder.discs_without_depth(&wide, 4000.0, 7.0, 0).means.is_empty(), "a second look finds nothing bare");
+        assert!(
+            seeder.discs_without_depth(&wide, Density { n_most: 4000.0, px_each: 1.0 }, 7.0).means.is_empty(),
+            "a second look finds nothing bare"
+        );
     }
 
     #[test]
     fn without_any_neighbour_a_disc_lies_at_the_default() {
-        let discs = Seeder::default().discs_without_depth(&sees_wall([40, 40], false), 100.0, 7.0, 0);
+        let discs = Seeder::default().discs_without_depth(
+            &sees_wall([40, 40], false),
+            Density { n_most: 100.0, px_each: 1.0 },
+            7.0,
+        );
         assert_eq!(discs.means.len(), 100);
         assert!(discs.means.iter().all(|mean| (mean[2] - 7.0).abs() < 1e-4));
     }

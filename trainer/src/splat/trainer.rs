@@ -2,21 +2,21 @@
 #![expect(clippy::cast_possible_truncation, reason = "counts derived from caps that are u32, and bits of a seed")]
 
 mod checkpoint;
+mod size;
 
 use super::arrays::SplatArrays;
 use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_bins, n_sh_rest, n_tiles};
 use super::camera_terms::{CameraFix, CameraTerms, PosedLens, TermSet};
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::options::SplatOptions;
-use super::params::{Camera, Growth, LOW_PASS_PX2, Rule, Supervision, status};
+use super::params::{Camera, Growth, LOW_PASS_PX2, Rule, Supervision, View, status};
 use super::passes::{self, GrowthBuffers, Target, ViewPasses};
-use super::seed::{self, Seeder};
-use super::trials::{CameraChoice, Due, Trial, Trials};
-use super::views::{LevelImages, TrainView, camera_of};
+use super::seed::{self, Density, Seeder};
+use super::trials::{CameraChoice, Candidate, Due, HeldBack, Now, Trial, Trials};
+use super::views::{LevelImages, TrainView};
 use crate::checkpoint::PendingCheckpoint;
-use crate::eval::{PixelPair, psnr};
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
-use crate::{Error, Keyframe, Method, Picture, Progress, Projection, RenderRequest, Split, ply};
+use crate::{Error, Keyframe, Method, Part, Picture, Progress, Projection, RenderRequest, Split, ply};
 use kinematics::Stamp;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
@@ -43,6 +43,8 @@ const DEPTH_CLIP_M: f64 = 0.2;
 
 /// Share of the most splats there may be that one image may take for its seeds: the others need some, too.
 const SEED_SHARE: f64 = 1.0 / 8.0;
+/// Pixels of an image that a seed stands for at least: with finer ones the first steps take longer than they gain.
+const PX_PER_SEED: f64 = 48.0;
 /// How bright the background may be that changes every step: enough to keep black things solid. Up to 1 costs 1 dB
 /// in the first few hundred steps, while much is still bare.
 const VARIED_BACKGROUND: f32 = 0.25;
@@ -66,6 +68,7 @@ pub struct SplatTrainer {
     draw_frame: Option<Frame>,
     learn_status: Buffer,
     draw_status: Buffer,
+    draw_view: Buffer,
     rule: Buffer,
     supervision: Buffer,
     plain: Buffer,
@@ -160,6 +163,7 @@ impl SplatTrainer {
             draw_frame: None,
             learn_status: gpu.storage_with("splat.learn_status", &zeros)?,
             draw_status: gpu.storage_with("splat.draw_status", &zeros)?,
+            draw_view: gpu.uniform_with("splat.draw_view", &<View as bytemuck::Zeroable>::zeroed()),
             rule: gpu.uniform_with("splat.rule", &<Rule as bytemuck::Zeroable>::zeroed()),
             supervision: gpu.uniform_with(
                 "splat.supervision",
@@ -180,7 +184,7 @@ impl SplatTrainer {
                 },
             )?,
             loaded_fixes: BTreeMap::new(),
-            trials: Trials::new(&options.cameras),
+            trials: Trials::new(&options.cameras, options.count),
             passes: Passes::default(),
             seeder: Seeder::default(),
             pending: Vec::new(),
@@ -233,28 +237,25 @@ impl SplatTrainer {
 
     /// What was learned about each camera; empty where nothing is.
     pub fn camera_fixes(&mut self) -> Result<BTreeMap<String, CameraFix>, Error> {
-        if !self.cameras.set.any() {
+        self.settle()?;
+        let shown = self.trials.instead().map(|state| &state.cameras);
+        let (set, terms) = shown.map_or((self.cameras.set, &self.cameras.terms), |(set, terms)| (*set, terms));
+        if !set.any() {
             return Ok(self.loaded_fixes.clone());
         }
-        self.settle()?;
-        self.cameras.fixes(&self.gpu)
+        self.cameras.fixes(&self.gpu, set, terms)
+    }
+
+    /// The camera of a keyframe as it is learned now, with what is being tried.
+    fn learned_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {
+        let (set, terms) = (self.cameras.set, &self.cameras.terms);
+        let fixes = if set.any() { self.cameras.fixes(&self.gpu, set, terms)? } else { BTreeMap::new() };
+        Ok(fixed(&fixes, keyframe))
     }
 
     /// Gradients that were not finite and were dropped.
     pub fn n_poisoned(&self) -> u64 {
         self.n_poisoned
-    }
-
-    /// One step on the first view with a timestamp around every pass; empty without timestamps.
-    pub fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
-        self.settle()?;
-        self.begin_learning()?;
-        let learn = self.learn()?;
-        self.write_rule();
-        self.record_step(&learn, self.step)?;
-        let timings = self.passes.submit_timed(&self.gpu)?;
-        self.step += 1;
-        Ok(timings)
     }
 
     fn learn(&mut self) -> Result<Arc<LearnPipelines>, Error> {
@@ -288,7 +289,7 @@ impl SplatTrainer {
         if n_splats > self.splats.capacity {
             let capacity =
                 n_splats.max(self.splats.capacity.saturating_mul(3) / 2).min(self.options.cap().max(n_splats));
-            self.splats = self.splats.grown(&self.gpu, capacity)?;
+            self.splats = self.splats.reshaped(&self.gpu, capacity, self.splats.sh_degree)?;
             self.passes.forget_bindings();
         }
         Ok(())
@@ -296,8 +297,21 @@ impl SplatTrainer {
 
     fn tell_n(&self) {
         for status in [&self.learn_status, &self.draw_status] {
-            self.gpu.write(status, 4 * u64::from(status::N_SPLATS), bytemuck::bytes_of(&self.splats.n_splats));
+            self.tell_n_to(status, self.splats.n_splats);
         }
+    }
+
+    fn tell_n_to(&self, status: &Buffer, n_splats: u32) {
+        self.gpu.write(status, 4 * u64::from(status::N_SPLATS), bytemuck::bytes_of(&n_splats));
+    }
+
+    /// The splats that people see: while a change is being tried, those without it.
+    fn shown(&self) -> &SplatBuffers {
+        self.trials.instead().map_or(&self.splats, |state| &state.splats)
+    }
+
+    fn density(&self) -> Density {
+        Density { n_most: self.seeds_per_image, px_each: PX_PER_SEED }
     }
 
     /// Gives the keyframes since the last call discs where their depth shows something new.
@@ -307,7 +321,7 @@ impl SplatTrainer {
             return Ok(());
         }
         self.measure_scene();
-        let discs = self.seeder.discs(&pending, self.seeds_per_image, self.options.sh_degree);
+        let discs = self.seeder.discs(&pending, self.density());
         self.add(&discs)?;
         self.unseeded.extend(pending.into_iter().filter(|keyframe| keyframe.depth.is_none()));
         Ok(())
@@ -318,9 +332,7 @@ impl SplatTrainer {
         self.seed_from_depth()?;
         for keyframe in std::mem::take(&mut self.unseeded) {
             if self.has_depth {
-                let (n_most, default_m) = (self.seeds_per_image, self.scene_size_m);
-                let sh_degree = self.options.sh_degree;
-                let discs = self.seeder.discs_without_depth(&keyframe, n_most, default_m, sh_degree);
+                let discs = self.seeder.discs_without_depth(&keyframe, self.density(), self.scene_size_m);
                 self.add(&discs)?;
             }
         }
@@ -331,8 +343,7 @@ impl SplatTrainer {
         }
         if self.splats.n_splats == 0 && !self.views.is_empty() {
             let keyframes: Vec<&Keyframe> = self.views.iter().map(|view| view.keyframe.as_ref()).collect();
-            let cloud =
-                seed::random_cloud(&keyframes, self.options.seed, self.options.cap() as usize, self.options.sh_degree);
+            let cloud = seed::random_cloud(&keyframes, self.options.seed, self.options.cap() as usize);
             self.add(&cloud)?;
         }
         Ok(())
@@ -409,9 +420,8 @@ impl SplatTrainer {
         let view_ix = pick(step, self.views.len(), self.options.seed);
         let level_ix = level_at(step, self.coarse_steps);
         let size_px = self.views[view_ix].level(&self.gpu, level_ix)?.size_px;
-        let need = self.scratch_need(size_px, true);
-        self.ensure_scratch(need)?;
-        ensure_frame(&self.gpu, &mut self.learn_frame, &mut self.passes, size_px, true)?;
+        self.make_scratch(size_px, true)?;
+        self.make_learn_frame(size_px)?;
         let (lens, level) = self.views[view_ix].lens_and_level(&self.gpu, level_ix)?;
         let lens = lens.filter(|_| self.cameras.set.any());
         let (Some((_, scratch)), Some(frame)) = (&self.scratch, &self.learn_frame) else {
@@ -449,10 +459,16 @@ impl SplatTrainer {
         Ok(())
     }
 
-    fn scratch_need(&self, size_px: [u32; 2], learn: bool) -> ScratchSize {
-        let n_splats = self.splats.capacity;
+    /// Makes sure that a view of this size can be drawn, or learned from.
+    fn make_scratch(&mut self, size_px: [u32; 2], learn: bool) -> Result<(), Error> {
+        let n_splats = self.splats.capacity.max(self.shown().capacity);
         let n_entries = (2 * n_splats).max(1 << 14);
-        ScratchSize { n_splats, n_entries, n_slots: if learn { 2 * n_entries } else { 0 }, n_bins: n_bins(size_px) }
+        let n_slots = if learn { 2 * n_entries } else { 0 };
+        self.ensure_scratch(ScratchSize { n_splats, n_entries, n_slots, n_bins: n_bins(size_px) })
+    }
+
+    fn make_learn_frame(&mut self, size_px: [u32; 2]) -> Result<(), Error> {
+        ensure_frame(&self.gpu, &mut self.learn_frame, &mut self.passes, size_px, true)
     }
 
     fn ensure_scratch(&mut self, need: ScratchSize) -> Result<(), Error> {
@@ -514,11 +530,16 @@ impl SplatTrainer {
         Ok(())
     }
 
+    /// Step from which there are no more splats.
+    fn last_growth(&self) -> u64 {
+        let end = self.schedule_start + (GROWTH_END_FRAC * self.options.n_planned_steps as f64) as u64;
+        end.next_multiple_of(GROWTH_PERIOD) // Where a submit ends.
+    }
+
     /// Changes the splat count when it is due: dead splats get new places, and there are more of them up to the cap.
     fn grow_when_due(&mut self, learn: &LearnPipelines) -> Result<(), Error> {
-        let last = self.schedule_start + (GROWTH_END_FRAC * self.options.n_planned_steps as f64) as u64;
         let due = self.step >= GROWTH_START
-            && self.step < last
+            && self.step < self.last_growth()
             && self.step.is_multiple_of(GROWTH_PERIOD)
             && self.grown_at != self.step;
         if !due {
@@ -530,8 +551,8 @@ impl SplatTrainer {
         }
         self.grown_at = self.step;
         let n_before = self.splats.n_splats;
-        let wanted = n_before + (f64::from(n_before) * GROWTH_FRAC).ceil() as u32;
-        let n_after = wanted.min(self.options.cap()).max(n_before);
+        let more = if self.trials.may_grow() { (f64::from(n_before) * GROWTH_FRAC).ceil() as u32 } else { 0 };
+        let n_after = (n_before + more).min(self.options.cap()).max(n_before);
         self.make_room(n_after)?;
         let growth = Growth {
             n_before,
@@ -561,7 +582,7 @@ impl SplatTrainer {
 
     fn state(&self) -> Result<State, Error> {
         Ok(State {
-            splats: self.splats.grown(&self.gpu, self.splats.capacity)?,
+            splats: self.splats.reshaped(&self.gpu, self.splats.capacity, self.splats.sh_degree)?,
             cameras: (self.cameras.set, self.cameras.copy(&self.gpu)?),
             step: self.step,
             grown_at: self.grown_at,
@@ -578,104 +599,100 @@ impl SplatTrainer {
         Ok(())
     }
 
-    /// Begins, turns and ends trials of what may be learned about cameras.
-    fn try_when_due(&mut self) -> Result<(), Error> {
-        if matches!(self.trials.due(self.step), Due::Nothing) {
-            return Ok(());
+    fn now(&self) -> Now {
+        Now {
+            step: self.step,
+            n_splats: self.splats.n_splats,
+            is_mature: self.step >= self.last_growth(),
+            sh_degree: self.splats.sh_degree,
         }
-        self.settle()?;
-        match self.trials.due(self.step) {
-            Due::Nothing => {}
-            Due::Begin => {
-                let state = self.state()?;
-                self.trials.begin(state, self.step, self.views.len());
-            }
-            Due::Turn => {
-                let without_db = self.score_held_back()?;
-                let state = self.state()?;
-                if let Some((from, terms)) = self.trials.turn(state, without_db) {
-                    self.go_back(from)?;
-                    self.cameras.learn_also(terms);
+    }
+
+    /// Begins, turns and ends trials. What follows from the end of one is done at the same step: when the next submit
+    /// ends is a matter of time.
+    fn try_when_due(&mut self) -> Result<(), Error> {
+        while self.trials.due(self.now()) != Due::Nothing {
+            self.settle()?; // Steps may turn out to be lost.
+            match self.trials.due(self.now()) {
+                Due::Nothing => {}
+                Due::Begin(candidate) => {
+                    let state = self.state()?;
+                    self.trials.begin(candidate, state, self.views.len());
+                }
+                Due::Turn => self.turn_trial()?,
+                Due::End => {
+                    let with_db = self.score_held_back()?;
+                    if let Some(instead) = self.trials.end(&with_db) {
+                        self.go_back(instead)?;
+                    }
+                }
+                Due::Join => {
+                    for keyframe in self.trials.settle() {
+                        self.push(keyframe)?;
+                    }
                     self.begin_learning()?;
                 }
-            }
-            Due::End => {
-                let with_db = self.score_held_back()?;
-                if let Some(instead) = self.trials.end(&with_db) {
-                    self.go_back(instead)?;
-                }
-            }
-            Due::Join => {
-                for keyframe in self.trials.settle() {
-                    self.push(keyframe)?;
-                }
-                self.begin_learning()?;
             }
         }
         Ok(())
     }
 
-    /// PSNR of keyframes that were not learned from, dB; of many, some spread over them.
-    fn score_held_back(&mut self) -> Result<Vec<f64>, Error> {
-        const MOST: usize = 24;
-        let held_back = self.trials.held_back.clone();
-        let stride = held_back.len().div_ceil(MOST).max(1);
-        let mut scores = Vec::new();
-        for keyframe in held_back.iter().step_by(stride) {
-            let lens = self.posed_lens(keyframe)?;
-            let camera = Camera {
-                world_from_camera: lens.world_from_camera,
-                focal_px: lens.focal_px,
-                principal_px: lens.principal_px,
-                ..camera_of(keyframe)
-            };
-            let picture = self.draw_view(&camera, [0.0; 3])?;
-            scores.push(psnr(&PixelPair::new(keyframe.size_px, &picture.rgba_srgb, &keyframe.rgba_srgb)?)?);
+    /// Goes back to where a trial began, with the change.
+    fn turn_trial(&mut self) -> Result<(), Error> {
+        let without_db = self.score_held_back()?;
+        let state = self.state()?;
+        let Some((from, candidate)) = self.trials.turn(state, without_db) else { return Ok(()) };
+        self.go_back(from)?;
+        match candidate {
+            Candidate::Cameras(terms) => self.cameras.learn_also(terms),
+            Candidate::Halved { to, .. } => self.keep_most(to)?,
+            Candidate::ShDegree { to, .. } => self.lower_degree(to)?,
         }
-        Ok(scores)
+        self.begin_learning()
     }
 
-    /// How the trials of what may be learned about cameras ended so far.
+    /// How the trials of what the model needs ended so far.
     pub fn trials(&self) -> &[Trial] {
         &self.trials.ended
     }
 
     /// Draws one pinhole view.
     fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3]) -> Result<Picture, Error> {
+        self.draw_into_frame(camera, background_srgb, true)?;
+        let Some(frame) = &self.draw_frame else { return Err(Error::DeviceLost) };
+        let n = (camera.size_px[0] * camera.size_px[1]) as usize;
+        let pixels: Vec<u32> = self.gpu.read(&frame.pixels, n)?;
+        let depth_m = self.gpu.read(&frame.depths, n)?;
+        Ok(Picture { size_px: camera.size_px, rgba_srgb: bytemuck::cast_slice(&pixels).to_vec(), depth_m })
+    }
+
+    /// Draws one pinhole view into the frame for pictures, of the splats that people see or of those that learn.
+    fn draw_into_frame(&mut self, camera: &Camera, background_srgb: [f32; 3], shown: bool) -> Result<(), Error> {
         let size_px = camera.size_px;
-        let view = self.gpu.uniform_with("splat.draw_view", &camera.view());
+        self.gpu.write(&self.draw_view, 0, bytemuck::bytes_of(&camera.view()));
         let [red, green, blue] = background_srgb;
         let background = Supervision { background_srgb: [red, green, blue, 0.0], ..bytemuck::Zeroable::zeroed() };
         self.gpu.write(&self.plain, 0, bytemuck::bytes_of(&background));
         loop {
-            let need = self.scratch_need(size_px, false);
-            self.ensure_scratch(need)?;
+            self.make_scratch(size_px, false)?;
             ensure_frame(&self.gpu, &mut self.draw_frame, &mut self.passes, size_px, false)?;
+            let mut list = std::mem::take(&mut self.passes);
             let (Some((_, scratch)), Some(frame)) = (&self.scratch, &self.draw_frame) else {
                 return Err(Error::DeviceLost);
             };
-            let passes = ViewPasses {
-                gpu: &self.gpu,
-                splats: &self.splats,
-                scratch,
-                frame,
-                status: &self.draw_status,
-                view: &view,
-                size_px,
-            };
-            passes.draw(&mut self.passes, &self.draw);
-            passes.finish(&mut self.passes, &self.draw, &self.plain);
-            self.passes.submit(&self.gpu);
+            let splats = if shown { self.shown() } else { &self.splats };
+            self.tell_n_to(&self.draw_status, splats.n_splats);
+            let (gpu, status, view) = (&self.gpu, &self.draw_status, &self.draw_view);
+            let passes = ViewPasses { gpu, splats, scratch, frame, status, view, size_px };
+            passes.draw(&mut list, &self.draw);
+            passes.finish(&mut list, &self.draw, &self.plain);
+            list.submit(&self.gpu);
+            self.passes = list;
             let counters: Vec<u32> = self.gpu.read(&self.draw_status, status::LEN)?;
-            if self.mend(&counters)? {
-                self.gpu.write(&self.draw_status, 4 * status::FAILED as u64, &[0; 12]);
-                continue;
+            if !self.mend(&counters)? {
+                return Ok(());
             }
-            let Some(frame) = &self.draw_frame else { return Err(Error::DeviceLost) };
-            let n = (size_px[0] * size_px[1]) as usize;
-            let pixels: Vec<u32> = self.gpu.read(&frame.pixels, n)?;
-            let depth_m = self.gpu.read(&frame.depths, n)?;
-            return Ok(Picture { size_px, rgba_srgb: bytemuck::cast_slice(&pixels).to_vec(), depth_m });
+            self.gpu.write(&self.draw_status, 4 * status::FAILED as u64, &[0; 12]);
         }
     }
 }
@@ -686,7 +703,7 @@ impl Method for SplatTrainer {
             return Ok(());
         }
         if keyframe.split == Split::Selection && self.trials.hold_back() {
-            self.trials.held_back.push(keyframe);
+            self.trials.held_back.push(HeldBack { keyframe, image: None });
             return Ok(());
         }
         self.settle()?;
@@ -742,6 +759,17 @@ impl Method for SplatTrainer {
         self.learn().map(drop)
     }
 
+    fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
+        self.settle()?;
+        self.begin_learning()?;
+        let learn = self.learn()?;
+        self.write_rule();
+        self.record_step(&learn, self.step)?;
+        let timings = self.passes.submit_timed(&self.gpu)?;
+        self.step += 1;
+        Ok(timings)
+    }
+
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         self.seed_from_depth()?;
         match request.projection {
@@ -766,23 +794,26 @@ impl Method for SplatTrainer {
     }
 
     fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {
-        let fixes = self.camera_fixes()?;
-        Ok(fixes.get(keyframe.camera.as_ref()).map_or_else(|| PosedLens::of(keyframe), |fix| fix.apply(keyframe)))
+        Ok(fixed(&self.camera_fixes()?, keyframe))
     }
 
     fn progress(&self) -> Progress {
         Progress {
             step: self.step,
-            primitives: self.splats.n_splats.into(),
-            bytes: self.splats.bytes(),
+            primitives: self.shown().n_splats.into(),
+            bytes: self.shown().bytes(),
             step_millis: self.step_millis,
         }
+    }
+
+    fn report(&self) -> Vec<Part> {
+        self.trials.ended.iter().map(Trial::part).collect()
     }
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {
         self.settle()?;
         if let Some(instead) = self.trials.give_up() {
-            log::info!("training ends before what is being tried about cameras could be judged: saved without it");
+            log::info!("training ends before what is being tried could be judged: saved without it");
             self.go_back(instead)?;
         }
         let arrays = self.arrays()?;
@@ -794,7 +825,7 @@ impl Method for SplatTrainer {
             "splats": arrays.n_splats(),
             "sh_degree": arrays.sh_degree,
             "seed": self.options.seed,
-            "trials": self.trials.ended,
+            "trials": self.report(),
             "cameras": self.camera_fixes()?,
         });
         let path = folder.join("model.json");
@@ -804,6 +835,11 @@ impl Method for SplatTrainer {
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         self.take_checkpoint()
     }
+}
+
+/// The camera of a keyframe as it is, where the input has it as [`PosedLens::of`].
+fn fixed(fixes: &BTreeMap<String, CameraFix>, keyframe: &Keyframe) -> PosedLens {
+    fixes.get(keyframe.camera.as_ref()).map_or_else(|| PosedLens::of(keyframe), |fix| fix.apply(keyframe))
 }
 
 /// What a saved model knows about cameras; a model without such a file, or of an earlier version, knows nothing.

@@ -1,29 +1,35 @@
-//! Whether learning something about the cameras pays: tried on a copy of the model, judged by images not learned from.
+//! Whether a part of the model pays: tried on a copy of the model, judged by images not learned from.
 //!
 //! At the start the selection keyframes are held back. Each candidate gets as many steps as the model without it, from
-//! the same state; it stays when the paired gain on the selection keyframes exceeds both [`LEAST_GAIN_DB`] and two
-//! standard errors. When all are settled the selection keyframes are learned from, too.
+//! the same state. What is added stays when the paired gain on the selection keyframes exceeds both a least gain and two
+//! standard errors; what is left out stays out unless leaving it out costs as much. When all is settled the selection
+//! keyframes are learned from, too.
 
 use super::camera_terms::TermSet;
 use super::trainer::State;
-use crate::Keyframe;
+use crate::gpu::Buffer;
+use crate::{Keyframe, Part};
+use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 use std::sync::Arc;
 
 /// Step of the first trial: earlier the scene is too rough to tell.
 pub(crate) const TRIAL_START: u64 = 500;
-/// Steps of a trial of terms that all images share, and least of any.
+/// Steps of a trial of what all images share, and least of any.
 const SHARED_STEPS: u64 = 250;
 /// How often each image is looked at in a trial of terms of its own, and the most steps for it.
 const ROUNDS: u64 = 4;
 const MOST_STEPS: u64 = 1200;
-/// A gain below this is none, dB.
+/// A gain below this is none, dB: of anything, and of twice the splats.
 const LEAST_GAIN_DB: f64 = 0.05;
+const LEAST_GAIN_OF_DOUBLING_DB: f64 = 0.1;
 /// Fewer selection keyframes tell nothing.
 const LEAST_IMAGES: usize = 4;
+/// Fewer splats are not divided further.
+const FEWEST_SPLATS: u32 = 1000;
 
 /// What is learned about cameras.
-#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum CameraChoice {
     /// These terms, from the first step on.
     Given(TermSet),
@@ -37,39 +43,151 @@ impl Default for CameraChoice {
     }
 }
 
+/// How the number of splats is found.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub enum CountChoice {
+    /// Grown up to the cap.
+    #[default]
+    ToCap,
+    /// Grown up to the cap, then halved as long as that costs less than 0.1 dB on held-back images.
+    Tested,
+}
+
+/// A change of the model that is tried.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Candidate {
+    /// These terms of cameras are learned, too.
+    Cameras(TermSet),
+    /// The half of the splats that shows least goes.
+    Halved {
+        /// Splats before.
+        from: u32,
+        /// Splats after.
+        to: u32,
+    },
+    /// Colors change less with the direction.
+    ShDegree {
+        /// Degree of spherical harmonics before.
+        from: u32,
+        /// Degree after.
+        to: u32,
+    },
+}
+
+impl Candidate {
+    /// What a change of the model must bring, or may cost where it makes the model smaller, dB.
+    fn least_gain_db(self) -> f64 {
+        match self {
+            Self::Halved { .. } => LEAST_GAIN_OF_DOUBLING_DB,
+            Self::Cameras(_) | Self::ShDegree { .. } => LEAST_GAIN_DB,
+        }
+    }
+
+    fn is_smaller(self) -> bool {
+        !matches!(self, Self::Cameras(_))
+    }
+}
+
+impl std::fmt::Display for Candidate {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Cameras(terms) => terms.fmt(f),
+            Self::Halved { from, to } => write!(f, "{to} of {from} splats"),
+            Self::ShDegree { from, to } => write!(f, "colors of degree {to} in place of {from}"),
+        }
+    }
+}
+
 /// How a trial ended.
-#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Trial {
     /// What was tried.
-    pub terms: TermSet,
+    pub candidate: Candidate,
     /// Mean gain over the selection keyframes, dB.
     pub gain_db: f64,
     /// Its standard error, dB.
     pub standard_error_db: f64,
     /// Selection keyframes.
     pub n_images: usize,
-    /// Whether the terms stay.
+    /// Whether the change stays.
     pub kept: bool,
 }
 
 impl Trial {
     /// Judges paired scores, dB.
-    pub(crate) fn of(terms: TermSet, without_db: &[f64], with_db: &[f64]) -> Self {
+    pub(crate) fn of(candidate: Candidate, without_db: &[f64], with_db: &[f64]) -> Self {
         let n = without_db.len().min(with_db.len());
         let gains: Vec<f64> = without_db.iter().zip(with_db).map(|(without, with)| with - without).collect();
         let mean = gains.iter().sum::<f64>() / n.max(1) as f64;
         let variance = gains.iter().map(|gain| (gain - mean).powi(2)).sum::<f64>() / n.saturating_sub(1).max(1) as f64;
         let standard_error_db = (variance / n.max(1) as f64).sqrt();
-        let kept = n > 1 && mean > LEAST_GAIN_DB.max(2.0 * standard_error_db);
-        Self { terms, gain_db: mean, standard_error_db, n_images: n, kept }
+        let counts = candidate.least_gain_db().max(2.0 * standard_error_db);
+        let kept = n > 1 && if candidate.is_smaller() { -mean <= counts } else { mean > counts };
+        Self { candidate, gain_db: mean, standard_error_db, n_images: n, kept }
     }
+
+    /// The part of the model that was tried: what is added, or what would be left out.
+    pub(crate) fn part(&self) -> Part {
+        let (part, is_left_out) = match self.candidate {
+            Candidate::Cameras(terms) => (terms.to_string(), false),
+            Candidate::Halved { from, to } => (format!("{from} splats over {to}"), true),
+            Candidate::ShDegree { from, to } => (format!("colors of degree {from} over {to}"), true),
+        };
+        Part {
+            part,
+            bought_db: if is_left_out { -self.gain_db } else { self.gain_db },
+            standard_error_db: self.standard_error_db,
+            n_images: self.n_images,
+            kept: self.kept != is_left_out,
+        }
+    }
+
+    fn tell(&self) {
+        let verdict = match (self.candidate, self.kept) {
+            (Candidate::Cameras(_), true) => "learned from here on",
+            (Candidate::Cameras(_), false) => "does not pay",
+            (Candidate::Halved { .. } | Candidate::ShDegree { .. }, true) => "enough",
+            (Candidate::Halved { .. } | Candidate::ShDegree { .. }, false) => "not enough",
+        };
+        log::info!(
+            "{}: {:+.2} dB on {} held-back images (standard error {:.2}): {verdict}",
+            self.candidate,
+            self.gain_db,
+            self.n_images,
+            self.standard_error_db,
+        );
+    }
+}
+
+/// A selection keyframe, and its image on the GPU once it was compared with.
+#[derive(Debug)]
+pub(crate) struct HeldBack {
+    pub(crate) keyframe: Arc<Keyframe>,
+    pub(crate) image: Option<Buffer>,
+}
+
+/// Whether the number of splats is settled.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) enum Count {
+    /// Grows up to the cap.
+    ToCap,
+    /// Grows, to be tried once it is mature.
+    Growing,
+    /// Found to be too many: halved until half is not enough.
+    Falling,
+    /// Stays.
+    Settled,
 }
 
 /// Where the trials stand.
 #[derive(Debug)]
 pub(crate) struct Trials {
     candidates: VecDeque<TermSet>,
-    pub(crate) held_back: Vec<Arc<Keyframe>>,
+    count: Count,
+    /// Degree of the colors that is tried next, once the number of splats is settled.
+    degree: u32,
+    pub(crate) held_back: Vec<HeldBack>,
     pub(crate) ended: Vec<Trial>,
     phase: Phase,
 }
@@ -77,18 +195,29 @@ pub(crate) struct Trials {
 #[derive(Debug)]
 enum Phase {
     Waiting,
-    Without { from: Box<State>, until: u64 },
-    With { instead: Box<State>, without_db: Vec<f64>, until: u64 },
+    Without { candidate: Candidate, from: Box<State>, until: u64 },
+    With { candidate: Candidate, instead: Box<State>, without_db: Vec<f64>, until: u64 },
     Settled,
 }
 
+/// What is still to be tried.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Untried {
+    is_settled: bool,
+    terms: Vec<TermSet>,
+    count: Count,
+    degree: u32,
+}
+
 /// What the trainer has to do at this step.
+#[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Due {
     /// Nothing.
     Nothing,
     /// Copy the state and go on.
-    Begin,
-    /// Score; go back to the copy; learn the candidate.
+    Begin(Candidate),
+    /// Score; go back to the copy; change what is tried.
     Turn,
     /// Score; decide.
     End,
@@ -96,14 +225,30 @@ pub(crate) enum Due {
     Join,
 }
 
+/// The splats as they are when the trainer asks what is due.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Now {
+    pub(crate) step: u64,
+    pub(crate) n_splats: u32,
+    /// Whether growth is over: earlier few splats do as well as many, which learn more slowly.
+    pub(crate) is_mature: bool,
+    /// Of their colors.
+    pub(crate) sh_degree: u32,
+}
+
 impl Trials {
-    pub(crate) fn new(choice: &CameraChoice) -> Self {
-        let candidates: VecDeque<TermSet> = match choice {
+    pub(crate) fn new(cameras: &CameraChoice, count: CountChoice) -> Self {
+        let candidates: VecDeque<TermSet> = match cameras {
             CameraChoice::Given(_) => VecDeque::new(),
             CameraChoice::Try(candidates) => candidates.iter().copied().collect(),
         };
-        let phase = if candidates.is_empty() { Phase::Settled } else { Phase::Waiting };
-        Self { candidates, held_back: Vec::new(), ended: Vec::new(), phase }
+        let count = match count {
+            CountChoice::ToCap => Count::ToCap,
+            CountChoice::Tested => Count::Growing,
+        };
+        let settled = candidates.is_empty() && count == Count::ToCap;
+        let phase = if settled { Phase::Settled } else { Phase::Waiting };
+        Self { candidates, count, degree: 0, held_back: Vec::new(), ended: Vec::new(), phase }
     }
 
     /// Whether selection keyframes are still held back.
@@ -111,14 +256,44 @@ impl Trials {
         !matches!(self.phase, Phase::Settled)
     }
 
-    pub(crate) fn due(&self, step: u64) -> Due {
+    /// Whether there may be more splats.
+    pub(crate) fn may_grow(&self) -> bool {
+        let candidate = match &self.phase {
+            Phase::Without { candidate, .. } | Phase::With { candidate, .. } => Some(candidate),
+            Phase::Waiting | Phase::Settled => None,
+        };
+        matches!(self.count, Count::ToCap | Count::Growing) && !matches!(candidate, Some(Candidate::Halved { .. }))
+    }
+
+    pub(crate) fn due(&self, now: Now) -> Due {
         match &self.phase {
-            Phase::Waiting if step < TRIAL_START => Due::Nothing,
-            Phase::Waiting if self.held_back.len() >= LEAST_IMAGES && !self.candidates.is_empty() => Due::Begin,
-            Phase::Waiting if self.candidates.is_empty() || step >= 2 * TRIAL_START => Due::Join,
-            Phase::Without { until, .. } if step >= *until => Due::Turn,
-            Phase::With { until, .. } if step >= *until => Due::End,
-            _ => Due::Nothing,
+            Phase::Waiting => self.next(now),
+            Phase::Without { until, .. } if now.step >= *until => Due::Turn,
+            Phase::With { until, .. } if now.step >= *until => Due::End,
+            Phase::Without { .. } | Phase::With { .. } | Phase::Settled => Due::Nothing,
+        }
+    }
+
+    fn next(&self, now: Now) -> Due {
+        if now.step < TRIAL_START {
+            return Due::Nothing;
+        }
+        if self.held_back.len() < LEAST_IMAGES {
+            // More of them may come, but not for ever.
+            return if now.step < 2 * TRIAL_START { Due::Nothing } else { Due::Join };
+        }
+        if let Some(terms) = self.candidates.front() {
+            return Due::Begin(Candidate::Cameras(*terms));
+        }
+        let halved = Candidate::Halved { from: now.n_splats, to: now.n_splats.div_ceil(2) };
+        let lower = Candidate::ShDegree { from: now.sh_degree, to: self.degree };
+        match self.count {
+            Count::ToCap => Due::Join,
+            Count::Settled if self.degree < now.sh_degree => Due::Begin(lower),
+            Count::Settled => Due::Join,
+            Count::Falling => Due::Begin(halved),
+            Count::Growing if now.is_mature => Due::Begin(halved),
+            Count::Growing => Due::Nothing,
         }
     }
 
@@ -131,19 +306,23 @@ impl Trials {
         }
     }
 
-    pub(crate) fn begin(&mut self, from: State, step: u64, n_views: usize) {
-        let own = self.candidates.front().is_some_and(|terms| terms.image_poses || terms.image_gains);
-        let n_steps = if own { (ROUNDS * n_views as u64).clamp(SHARED_STEPS, MOST_STEPS) } else { SHARED_STEPS };
-        self.phase = Phase::Without { from: Box::new(from), until: step + n_steps };
+    pub(crate) fn begin(&mut self, candidate: Candidate, from: State, n_views: usize) {
+        let n_steps = match candidate {
+            Candidate::Cameras(terms) if terms.image_poses || terms.image_gains => {
+                (ROUNDS * n_views as u64).clamp(SHARED_STEPS, MOST_STEPS)
+            }
+            _ => SHARED_STEPS,
+        };
+        let until = from.step + n_steps;
+        self.phase = Phase::Without { candidate, from: Box::new(from), until };
     }
 
-    /// The state to go back to, and what to learn from there.
-    pub(crate) fn turn(&mut self, instead: State, without_db: Vec<f64>) -> Option<(State, TermSet)> {
-        let terms = *self.candidates.front()?;
+    /// The state to go back to, and what to change there.
+    pub(crate) fn turn(&mut self, instead: State, without_db: Vec<f64>) -> Option<(State, Candidate)> {
         match std::mem::replace(&mut self.phase, Phase::Settled) {
-            Phase::Without { from, until } => {
-                self.phase = Phase::With { instead: Box::new(instead), without_db, until };
-                Some((*from, terms))
+            Phase::Without { candidate, from, until } => {
+                self.phase = Phase::With { candidate, instead: Box::new(instead), without_db, until };
+                Some((*from, candidate))
             }
             other => {
                 self.phase = other;
@@ -152,28 +331,28 @@ impl Trials {
         }
     }
 
-    /// The state to go on from, where the candidate does not stay.
+    /// The state to go on from, where the change does not stay.
     pub(crate) fn end(&mut self, with_db: &[f64]) -> Option<State> {
-        let terms = self.candidates.pop_front()?;
-        let Phase::With { instead, without_db, .. } = std::mem::replace(&mut self.phase, Phase::Waiting) else {
+        let Phase::With { candidate, instead, without_db, .. } = std::mem::replace(&mut self.phase, Phase::Waiting)
+        else {
             return None;
         };
-        log::debug!("without {without_db:.3?}, with {with_db:.3?} dB");
-        let trial = Trial::of(terms, &without_db, with_db);
-        log::info!(
-            "{}: {:+.2} dB on {} held-back images (standard error {:.2}): {}",
-            terms,
-            trial.gain_db,
-            trial.n_images,
-            trial.standard_error_db,
-            if trial.kept { "learned from here on" } else { "does not pay" }
-        );
+        log::debug!("{candidate}: without {without_db:.3?}, with {with_db:.3?} dB");
+        let trial = Trial::of(candidate, &without_db, with_db);
+        trial.tell();
         let kept = trial.kept;
         self.ended.push(trial);
+        match candidate {
+            Candidate::Cameras(_) => drop(self.candidates.pop_front()),
+            Candidate::Halved { to, .. } if kept && to > FEWEST_SPLATS => self.count = Count::Falling,
+            Candidate::Halved { .. } if kept => self.count = Count::Settled,
+            Candidate::Halved { .. } => self.count = Count::Settled,
+            Candidate::ShDegree { from, to } => self.degree = if kept { from } else { to + 1 },
+        }
         (!kept).then_some(*instead)
     }
 
-    /// Gives up a candidate that is being learned: the state to go back to. It is tried again where training goes on.
+    /// Gives up what is being tried: the state to go back to. It is tried again where training goes on.
     pub(crate) fn give_up(&mut self) -> Option<State> {
         match std::mem::replace(&mut self.phase, Phase::Waiting) {
             Phase::With { instead, .. } => Some(*instead),
@@ -184,12 +363,13 @@ impl Trials {
         }
     }
 
+    /// What was held back, to be learned from.
     pub(crate) fn settle(&mut self) -> Vec<Arc<Keyframe>> {
         self.phase = Phase::Settled;
-        std::mem::take(&mut self.held_back)
+        std::mem::take(&mut self.held_back).into_iter().map(|held_back| held_back.keyframe).collect()
     }
 
-    /// The state without the candidate, while one is being learned.
+    /// The state without the change, while one is being tried.
     pub(crate) fn instead(&self) -> Option<&State> {
         match &self.phase {
             Phase::With { instead, .. } => Some(instead),
@@ -197,21 +377,26 @@ impl Trials {
         }
     }
 
-    /// What is still to be tried; nothing once all is settled.
-    pub(crate) fn untried(&self) -> Vec<TermSet> {
-        if self.hold_back() { self.candidates.iter().copied().collect() } else { Vec::new() }
+    /// What a checkpoint has to hold; a trial that has not ended begins anew.
+    pub(crate) fn untried(&self) -> Untried {
+        Untried {
+            is_settled: !self.hold_back(),
+            terms: self.candidates.iter().copied().collect(),
+            count: self.count,
+            degree: self.degree,
+        }
     }
 
     /// Takes over what a checkpoint holds.
-    pub(crate) fn restore(&mut self, untried: Vec<TermSet>, ended: Vec<Trial>) {
-        self.phase = if untried.is_empty() { Phase::Settled } else { Phase::Waiting };
-        self.candidates = untried.into();
-        self.ended = ended;
+    pub(crate) fn restore(&mut self, untried: Untried, ended: Vec<Trial>) {
+        self.phase = if untried.is_settled { Phase::Settled } else { Phase::Waiting };
+        self.candidates = untried.terms.into();
+        (self.count, self.degree, self.ended) = (untried.count, untried.degree, ended);
     }
 
     /// Forgets a keyframe.
     pub(crate) fn remove(&mut self, gone: impl Fn(&Keyframe) -> bool) {
-        self.held_back.retain(|keyframe| !gone(keyframe));
+        self.held_back.retain(|held_back| !gone(&held_back.keyframe));
     }
 }
 
@@ -220,31 +405,47 @@ mod tests {
     use super::*;
 
     const POSES: TermSet = TermSet { mount: false, delay: false, lens: false, image_poses: true, image_gains: false };
+    const HALVED: Candidate = Candidate::Halved { from: 20_000, to: 10_000 };
 
     #[test]
     fn a_gain_counts_when_it_is_larger_than_its_scatter() {
-        let trial = |with: &[f64]| Trial::of(POSES, &[20.0, 22.0, 24.0, 21.0], with);
+        let trial = |with: &[f64]| Trial::of(Candidate::Cameras(POSES), &[20.0, 22.0, 24.0, 21.0], with);
         assert!(trial(&[20.5, 22.4, 24.6, 21.5]).kept);
         assert!(!trial(&[20.03, 22.04, 24.02, 21.03]).kept, "too small, if sure");
         assert!(!trial(&[23.0, 20.5, 25.5, 19.5]).kept, "large, but not sure");
         assert!(!trial(&[19.0, 21.0, 23.0, 20.0]).kept);
-        assert!(!Trial::of(POSES, &[20.0], &[25.0]).kept, "one image shows no scatter");
+        assert!(!Trial::of(Candidate::Cameras(POSES), &[20.0], &[25.0]).kept, "one image shows no scatter");
         let gain = trial(&[20.5, 22.5, 24.5, 21.5]);
         assert!((gain.gain_db - 0.5).abs() < 1e-12 && gain.standard_error_db < 1e-12);
     }
 
     #[test]
+    fn what_costs_little_is_left_out() {
+        let trial = |with: &[f64]| Trial::of(HALVED, &[20.0, 22.0, 24.0, 21.0], with);
+        assert!(trial(&[19.92, 21.93, 23.91, 20.92]).kept);
+        assert!(trial(&[20.5, 22.4, 24.6, 21.5]).kept, "fewer may even be better");
+        assert!(!trial(&[19.8, 21.7, 23.8, 20.7]).kept);
+        assert!(!Trial::of(HALVED, &[20.0], &[20.0]).kept, "one image tells nothing");
+        let part = trial(&[19.8, 21.7, 23.8, 20.7]).part();
+        assert!((part.bought_db - 0.25).abs() < 1e-12 && part.kept, "{part:?}");
+        assert!(!trial(&[19.92, 21.93, 23.91, 20.92]).part().kept);
+    }
+
+    #[test]
     fn without_candidates_nothing_is_held_back() {
-        let trials = Trials::new(&CameraChoice::default());
-        assert!(!trials.hold_back());
-        assert!(matches!(trials.due(10_000), Due::Nothing));
+        let trials = Trials::new(&CameraChoice::default(), CountChoice::ToCap);
+        assert!(!trials.hold_back() && trials.may_grow());
+        assert_eq!(trials.due(Now { step: 10_000, n_splats: 5000, is_mature: true, sh_degree: 3 }), Due::Nothing);
     }
 
     #[test]
     fn too_few_images_join_in_time() {
-        let trials = Trials::new(&CameraChoice::Try(vec![POSES]));
-        assert!(trials.hold_back());
-        assert!(matches!(trials.due(TRIAL_START), Due::Nothing));
-        assert!(matches!(trials.due(2 * TRIAL_START), Due::Join));
+        for count in [CountChoice::ToCap, CountChoice::Tested] {
+            let trials = Trials::new(&CameraChoice::Try(vec![POSES]), count);
+            assert!(trials.hold_back());
+            let due = |step| trials.due(Now { step, n_splats: 5000, is_mature: false, sh_degree: 3 });
+            assert_eq!(due(TRIAL_START), Due::Nothing);
+            assert_eq!(due(2 * TRIAL_START), Due::Join);
+        }
     }
 }

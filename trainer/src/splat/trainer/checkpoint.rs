@@ -8,7 +8,7 @@ use crate::splat::camera_terms::{CameraSlots, TermSet};
 use crate::splat::options::SplatOptions;
 use crate::splat::params::status;
 use crate::splat::seed::Seeder;
-use crate::splat::trials::Trial;
+use crate::splat::trials::{Trial, Untried};
 use crate::splat::views::TrainView;
 use crate::{Error, Keyframe, Split};
 use serde::{Deserialize, Serialize};
@@ -35,6 +35,7 @@ struct State {
     n_poisoned: u32,
     n_splats: u32,
     capacity: u32,
+    sh_degree: u32,
     active_degree: u32,
     scene_size_m: f64,
     has_depth: bool,
@@ -47,7 +48,7 @@ struct State {
     slots: CameraSlots,
     /// What is learned about cameras, and what is still to be tried.
     terms: TermSet,
-    untried: Vec<TermSet>,
+    untried: Untried,
     tried: Vec<Trial>,
 }
 
@@ -124,6 +125,7 @@ impl SplatTrainer {
             n_poisoned: u32::try_from(self.n_poisoned).unwrap_or(u32::MAX),
             n_splats: splats.n_splats,
             capacity: splats.capacity,
+            sh_degree: splats.sh_degree,
             active_degree: splats.active_degree(),
             scene_size_m: self.scene_size_m,
             has_depth: self.has_depth,
@@ -174,7 +176,7 @@ impl SplatTrainer {
             serde_json::from_value(checkpoint.state.clone()).map_err(|error| bad_state(error.to_string()))?;
         let (views, rest) = matched(&state, keyframes)?;
         let n_splats = state.n_splats;
-        if n_splats > state.capacity || state.active_degree > state.options.sh_degree || state.options.sh_degree > 3 {
+        if n_splats > state.capacity || state.active_degree > state.sh_degree || state.sh_degree > 3 {
             return Err(bad_state(format!("{n_splats} splats of degree {} do not fit", state.active_degree)));
         }
         let unseeded = state.unseeded.iter().map(|ix| views.get(*ix).cloned());
@@ -182,7 +184,7 @@ impl SplatTrainer {
         let step = u32::try_from(state.step).map_err(|_| bad_state(format!("step {}", state.step)))?;
 
         let mut trainer = Self::new(gpu, state.options)?;
-        trainer.splats = SplatBuffers::new(&trainer.gpu, state.capacity, trainer.options.sh_degree)?;
+        trainer.splats = SplatBuffers::new(&trainer.gpu, state.capacity, state.sh_degree)?;
         for (name, (buffer, n_planes, bytes)) in ARRAYS.into_iter().zip(trainer.splats.planes()) {
             let used_bytes = u64::from(n_splats) * bytes;
             let array = checkpoint.array(name, u64::from(n_planes) * used_bytes)?;

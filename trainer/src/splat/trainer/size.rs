@@ -1,0 +1,322 @@
+//! How large the model has to be: what each splat contributes, what remains without the least of them, what colors need.
+
+use super::SplatTrainer;
+use crate::gpu::Buffer;
+use crate::splat::buffers::SplatBuffers;
+use crate::splat::kernels::LearnPipelines;
+use crate::splat::params::{Camera, Gathering, status};
+use crate::splat::passes::ViewPasses;
+use crate::splat::views::camera_of;
+use crate::{Error, Keyframe};
+
+/// Most images held back that a score is the mean over, and most views that tell what a splat contributes.
+const MOST_SCORED: usize = 24;
+const MOST_VIEWS: usize = 64;
+
+impl SplatTrainer {
+    /// PSNR of keyframes that were not learned from, dB; of many, some spread over them.
+    pub(super) fn score_held_back(&mut self) -> Result<Vec<f64>, Error> {
+        let learn = self.learn()?;
+        let stride = self.trials.held_back.len().div_ceil(MOST_SCORED).max(1);
+        let mut scores = Vec::new();
+        for ix in (0..self.trials.held_back.len()).step_by(stride) {
+            let image = match self.trials.held_back[ix].image.take() {
+                Some(image) => image,
+                None => self.gpu.storage_with("splat.held_back", &self.trials.held_back[ix].keyframe.rgba_srgb)?,
+            };
+            let keyframe = self.trials.held_back[ix].keyframe.clone();
+            scores.extend(self.score(&learn, &keyframe, &image)?);
+            self.trials.held_back[ix].image = Some(image);
+        }
+        Ok(scores)
+    }
+
+    /// PSNR of the model as it learns, of one image; `None` where nothing was seen.
+    fn score(&mut self, learn: &LearnPipelines, keyframe: &Keyframe, image: &Buffer) -> Result<Option<f64>, Error> {
+        let lens = self.learned_lens(keyframe)?;
+        let camera = Camera {
+            world_from_camera: lens.world_from_camera,
+            focal_px: lens.focal_px,
+            principal_px: lens.principal_px,
+            ..camera_of(keyframe)
+        };
+        self.draw_into_frame(&camera, [0.0; 3], false)?;
+        let Some(frame) = &self.draw_frame else { return Err(Error::DeviceLost) };
+        let n_groups = (camera.size_px[0] * camera.size_px[1]).div_ceil(256);
+        let buffers = [
+            ("view", &self.draw_view),
+            ("pixels", &frame.pixels),
+            ("target_image", image),
+            ("squares", &frame.squares),
+        ];
+        self.passes.dispatch(&self.gpu, &learn.score, n_groups.into(), &buffers);
+        self.passes.submit(&self.gpu);
+        let sums: Vec<[u32; 2]> = self.gpu.read(&frame.squares, n_groups as usize)?;
+        let [square, n_seen] = [0, 1].map(|part| sums.iter().map(|sum| u64::from(sum[part])).sum::<u64>());
+        let mean_square = square.max(1) as f64 / (3 * n_seen) as f64; // One level of one color: nothing is better.
+        Ok((n_seen > 0).then(|| 10.0 * (255.0f64.powi(2) / mean_square).log10()))
+    }
+
+    /// What each splat contributes to the views: the sum of its blending weights, in pixels.
+    pub(super) fn contributions(&mut self, learn: &LearnPipelines) -> Result<Vec<f32>, Error> {
+        let contributions = self.gpu.storage("splat.contributions", 4 * u64::from(self.splats.n_splats))?;
+        let stride = self.views.len().div_ceil(MOST_VIEWS).max(1);
+        for view_ix in (0..self.views.len()).step_by(stride) {
+            loop {
+                self.list_contributions(learn, view_ix, &contributions)?;
+                self.passes.submit(&self.gpu);
+                let counters: Vec<u32> = self.gpu.read(&self.draw_status, status::LEN)?;
+                if !self.mend(&counters)? {
+                    break;
+                }
+                self.gpu.write(&self.draw_status, 4 * status::FAILED as u64, &[0; 12]);
+            }
+        }
+        self.passes.forget_bindings();
+        self.gpu.read(&contributions, self.splats.n_splats as usize)
+    }
+
+    /// Lists the passes that add what the splats contribute to one view; they add nothing where a buffer is too small.
+    fn list_contributions(
+        &mut self,
+        learn: &LearnPipelines,
+        view_ix: usize,
+        contributions: &Buffer,
+    ) -> Result<(), Error> {
+        let size_px = self.views[view_ix].level(&self.gpu, 0)?.size_px;
+        self.make_scratch(size_px, true)?;
+        self.make_learn_frame(size_px)?;
+        self.tell_n();
+        let level = self.views[view_ix].level(&self.gpu, 0)?;
+        let (Some((_, scratch)), Some(frame)) = (&self.scratch, &self.learn_frame) else {
+            return Err(Error::DeviceLost);
+        };
+        let view = ViewPasses {
+            gpu: &self.gpu,
+            splats: &self.splats,
+            scratch,
+            frame,
+            status: &self.draw_status,
+            view: &level.view,
+            size_px,
+        };
+        // An error of one in every pixel, and no slope.
+        let ones = [0.0f32, 1.0].repeat((size_px[0] * size_px[1]) as usize);
+        self.gpu.write(&frame.rest, 0, bytemuck::cast_slice(&ones));
+        self.passes.clear(&frame.upstream);
+        view.draw(&mut self.passes, &self.draw);
+        view.backward(&mut self.passes, learn);
+        view.contribute(&mut self.passes, learn, contributions);
+        Ok(())
+    }
+
+    /// Keeps the `n_kept` splats that contribute most, in their order.
+    pub(super) fn keep_most(&mut self, n_kept: u32) -> Result<(), Error> {
+        let learn = self.learn()?;
+        let contributions = self.contributions(&learn)?;
+        let mut by_worth: Vec<u32> = (0..self.splats.n_splats).collect();
+        by_worth.sort_by(|a, b| contributions[*b as usize].total_cmp(&contributions[*a as usize]).then(a.cmp(b)));
+        by_worth.truncate(n_kept as usize);
+        by_worth.sort_unstable();
+        self.splats = gathered(self, &learn, &by_worth)?;
+        self.passes.forget_bindings();
+        self.tell_n();
+        Ok(())
+    }
+
+    /// Goes on with colors of a lower degree.
+    pub(super) fn lower_degree(&mut self, sh_degree: u32) -> Result<(), Error> {
+        self.splats = self.splats.reshaped(&self.gpu, self.splats.capacity, sh_degree)?;
+        self.passes.forget_bindings();
+        Ok(())
+    }
+}
+
+/// The splats of the given indices with their moments.
+fn gathered(trainer: &mut SplatTrainer, learn: &LearnPipelines, kept: &[u32]) -> Result<SplatBuffers, Error> {
+    let (gpu, splats) = (&trainer.gpu, &trainer.splats);
+    let n_kept = u32::try_from(kept.len()).expect("no more than there are splats");
+    let mut fewer = SplatBuffers::new(gpu, n_kept, splats.sh_degree)?;
+    let indices = gpu.storage_with("splat.kept", bytemuck::cast_slice(kept))?;
+    for ((from, n_planes, bytes), (to, _, _)) in splats.planes().iter().zip(fewer.planes()) {
+        let words = u32::try_from(bytes / 4).expect("an entry has a few words");
+        let gathering = Gathering {
+            n_kept,
+            n_planes: *n_planes,
+            words,
+            from_capacity: splats.capacity,
+            to_capacity: fewer.capacity,
+        };
+        let buffers = [
+            ("gathering", &gpu.uniform_with("splat.gathering", &gathering)),
+            ("kept", &indices),
+            ("from_words", *from),
+            ("to_words", to),
+        ];
+        let n_words = u64::from(n_kept) * u64::from(words) * u64::from(*n_planes);
+        trainer.passes.dispatch(gpu, &learn.gather, n_words.div_ceil(256), &buffers);
+    }
+    trainer.passes.submit(gpu);
+    fewer.set_active_degree(gpu, splats.active_degree());
+    fewer.set_n(gpu, n_kept);
+    Ok(fewer)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::eval::{PixelPair, psnr};
+    use crate::gpu::{Gpu, GpuOptions};
+    use crate::splat::learning::{n_keyframes, options, request, test_psnr, train};
+    use crate::splat::trials::{Candidate, CountChoice};
+    use crate::splat::{SplatOptions, Trial};
+    use crate::{Method, Split};
+    use std::sync::Arc;
+
+    fn trained(count: CountChoice, keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, n_steps: u64) -> SplatTrainer {
+        let options = SplatOptions { count, max_splats: 4000, n_planned_steps: 1500, ..options() };
+        let mut trainer = SplatTrainer::new(gpu, options).unwrap();
+        for keyframe in keyframes {
+            trainer.push(keyframe.clone()).unwrap();
+        }
+        train(&mut trainer, n_steps);
+        trainer
+    }
+
+    fn some_trained(n_steps: u64) -> (SplatTrainer, Vec<Arc<Keyframe>>) {
+        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let keyframes = n_keyframes(&gpu, 12, true);
+        (trained(CountChoice::Tested, &keyframes, gpu, n_steps), keyframes)
+    }
+
+    #[test]
+    fn scores_are_those_of_the_pictures() {
+        let (mut trainer, keyframes) = some_trained(60);
+        let held_back: Vec<_> = keyframes.iter().filter(|keyframe| keyframe.split == Split::Selection).collect();
+        let scores = trainer.score_held_back().unwrap();
+        assert_eq!(scores.len(), held_back.len());
+        for (score, keyframe) in scores.iter().zip(held_back) {
+            let picture = trainer.render(&request(keyframe.world_from_camera)).unwrap();
+            let pair = PixelPair::new(keyframe.size_px, &picture.rgba_srgb, &keyframe.rgba_srgb).unwrap();
+            assert!((psnr(&pair).unwrap() - score).abs() < 1e-9);
+        }
+    }
+
+    /// What blends into a pixel and what it lets through sum to one.
+    #[test]
+    fn contributions_add_up_to_what_is_covered() {
+        let (mut trainer, _) = some_trained(60);
+        trainer.views.truncate(1);
+        let learn = trainer.learn().unwrap();
+        let contributions = trainer.contributions(&learn).unwrap();
+        let n_pixels = trainer.views[0].keyframe.size_px.iter().product::<u32>() as usize;
+        let image = &trainer.learn_frame.as_ref().unwrap().image;
+        let colors: Vec<[f32; 4]> = trainer.gpu.read(image, n_pixels).unwrap();
+        let covered: f64 = colors.iter().map(|[.., transmittance]| 1.0 - f64::from(*transmittance)).sum();
+        let told: f64 = contributions.iter().map(|sum| f64::from(*sum)).sum();
+        assert!(covered > 0.2 * n_pixels as f64 && (told / covered - 1.0).abs() < 1e-4, "{told} of {covered}");
+    }
+
+    #[test]
+    fn the_splats_that_contribute_most_stay_as_they_are() {
+        let (mut trainer, _) = some_trained(120);
+        let learn = trainer.learn().unwrap();
+        let contributions = trainer.contributions(&learn).unwrap();
+        let before = words(&trainer);
+        let n_kept = trainer.splats.n_splats / 3;
+        trainer.keep_most(n_kept).unwrap();
+        let after = words(&trainer);
+        assert!(trainer.splats.n_splats == n_kept && n_kept > 50, "{n_kept}");
+        let mut sorted = contributions.clone();
+        sorted.sort_by(|a, b| b.total_cmp(a));
+        let least = sorted[n_kept as usize - 1];
+        let kept: Vec<usize> = (0..contributions.len()).filter(|ix| contributions[*ix] >= least).collect();
+        assert_eq!(kept.len(), n_kept as usize, "no two contribute the same here");
+        for (before, after) in before.iter().zip(&after) {
+            let picked: Vec<u32> = kept.iter().flat_map(|ix| before[*ix].iter().copied()).collect();
+            assert_eq!(picked, after.concat());
+        }
+    }
+
+    /// Of every plane of every buffer, the words of each splat.
+    fn words(trainer: &SplatTrainer) -> Vec<Vec<Vec<u32>>> {
+        let splats = &trainer.splats;
+        let mut all = Vec::new();
+        for (buffer, n_planes, bytes) in splats.planes() {
+            let words: Vec<u32> = trainer.gpu.read(buffer, (buffer.bytes() / 4) as usize).unwrap();
+            let per_plane = splats.capacity as usize * (bytes / 4) as usize;
+            for plane in words.chunks_exact(per_plane.max(1)).take(n_planes as usize) {
+                all.push(
+                    plane
+                        .chunks_exact((bytes / 4) as usize)
+                        .take(splats.n_splats as usize)
+                        .map(<[u32]>::to_vec)
+                        .collect(),
+                );
+            }
+        }
+        all
+    }
+
+    /// The same images with noise of up to a quarter of the range: no model can score much more than 21 dB on them.
+    fn noisy(keyframes: &[Arc<Keyframe>]) -> Vec<Arc<Keyframe>> {
+        let noisy = |keyframe: &Arc<Keyframe>| {
+            let mut state = keyframe.stamp.0.cast_unsigned();
+            let mut rgba = keyframe.rgba_srgb.to_vec();
+            for pixel in rgba.chunks_exact_mut(4) {
+                for color in &mut pixel[..3] {
+                    state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                    let noise = i16::try_from((state >> 33) % 129).unwrap() - 64;
+                    *color = u8::try_from((i16::from(*color) + noise).clamp(0, 255)).unwrap();
+                }
+            }
+            Arc::new(Keyframe { rgba_srgb: rgba.into(), ..keyframe.as_ref().clone() })
+        };
+        keyframes.iter().map(noisy).collect()
+    }
+
+    /// Where noise hides the details, few splats are enough, and colors that do not change with the direction.
+    #[test]
+    fn takes_no_more_than_the_scene_needs_and_the_same_twice() {
+        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let clean = n_keyframes(&gpu, 36, false); // Begins with a cloud as large as the cap.
+        let keyframes = noisy(&clean);
+        let mut tested = trained(CountChoice::Tested, &keyframes, gpu.clone(), 1750);
+        let mut again = trained(CountChoice::Tested, &keyframes, gpu, 1750);
+        assert!(again.arrays().unwrap() == tested.arrays().unwrap());
+        train(&mut tested, 1200);
+        let told: Vec<Trial> = tested.trials().to_vec();
+        assert!(told.iter().any(|trial| matches!(trial.candidate, Candidate::Halved { .. }) && trial.kept), "{told:?}");
+        let n_learned = keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).count();
+        assert!(!tested.trials.hold_back() && tested.views.len() == n_learned, "{told:?}");
+        assert!(tested.progress().primitives <= 2000 && tested.splats.sh_degree == 0, "{told:?}");
+        let tests = keyframes.iter().zip(&clean).filter(|(keyframe, _)| keyframe.split == Split::Test);
+        let ceilings: Vec<f64> = tests
+            .map(|(noisy, clean)| {
+                psnr(&PixelPair::new(noisy.size_px, &clean.rgba_srgb, &noisy.rgba_srgb).unwrap()).unwrap()
+            })
+            .collect();
+        let ceiling = ceilings.iter().sum::<f64>() / ceilings.len() as f64;
+        let reached = test_psnr(&mut tested, &keyframes);
+        assert!(reached > ceiling - 1.5, "{reached} of {ceiling} dB, {told:?}");
+    }
+
+    /// While half of the splats are being tried, people see all of them.
+    #[test]
+    fn what_is_being_tried_is_not_shown() {
+        let (mut trainer, keyframes) = some_trained(400);
+        let state = trainer.state().unwrap();
+        trainer.trials.begin(Candidate::Halved { from: 0, to: 0 }, state, 1);
+        let view = request(keyframes[0].world_from_camera);
+        let before = trainer.render(&view).unwrap();
+        let n_before = trainer.progress().primitives;
+        let instead = trainer.state().unwrap();
+        trainer.trials.turn(instead, Vec::new());
+        trainer.keep_most(50).unwrap();
+        assert_eq!(trainer.progress().primitives, n_before);
+        assert!(trainer.render(&view).unwrap().rgba_srgb == before.rgba_srgb);
+        let instead = trainer.trials.give_up().unwrap();
+        trainer.go_back(instead).unwrap();
+        assert!(trainer.render(&view).unwrap().rgba_srgb == before.rgba_srgb);
+    }
+}
