@@ -244,6 +244,11 @@ impl SplatTrainer {
     }
 
     #[cfg(test)]
+    pub(super) fn assume_step_millis(&mut self, millis: f64) {
+        self.step_millis = millis;
+    }
+
+    #[cfg(test)]
     pub(super) fn n_steps_on_gpu(&self) -> u64 {
         self.gpu.read::<u32>(&self.learn_status, status::LEN).unwrap()[status::STEP].into()
     }
