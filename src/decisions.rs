@@ -36,7 +36,7 @@ pub(crate) struct Settings {
     /// Share of the width and height that images were shrunk to.
     pub(crate) scale: f64,
     /// Updates made before, where it went on from a checkpoint.
-    pub(crate) from_step: u64,
+    pub(crate) from_step: Option<u64>,
     pub(crate) options: SplatOptions,
 }
 
@@ -46,7 +46,7 @@ pub(crate) struct About<'a> {
     pub(crate) data: Option<&'a Path>,
     pub(crate) adapter: String,
     pub(crate) scale: f64,
-    pub(crate) from_step: u64,
+    pub(crate) from_step: Option<u64>,
     pub(crate) options: SplatOptions,
 }
 
@@ -183,8 +183,8 @@ impl DecisionLog {
     /// Begins a log in the folder of a run; one that goes on from a checkpoint leaves the log up to there alone.
     pub(crate) fn create(folder: &Path, settings: Settings) -> anyhow::Result<Self> {
         let name = match settings.from_step {
-            0 => FILE.to_owned(),
-            step => FILE.replace('.', &format!("-from-{step}.")),
+            None => FILE.to_owned(),
+            Some(step) => FILE.replace('.', &format!("-from-{step}.")),
         };
         let path = folder.join(name);
         let mut file = File::create(&path).with_context(|| format!("cannot write {}", path.display()))?;
@@ -345,7 +345,7 @@ mod tests {
     use super::*;
     use kinematics::Transform;
 
-    fn settings(from_step: u64) -> Settings {
+    fn settings(from_step: Option<u64>) -> Settings {
         Settings::new(About {
             method: "splat",
             data: Some(Path::new("somewhere/scan.mcap")),
@@ -375,7 +375,7 @@ mod tests {
 
     /// Two keyframes with a look between them, one that goes, and the end.
     fn written(folder: &Path) -> String {
-        let mut log = DecisionLog::create(folder, settings(0)).expect("a log");
+        let mut log = DecisionLog::create(folder, settings(None)).expect("a log");
         log.seeded(); // Before there is anything to see.
         log.pushed(0, &keyframe(17, Split::Test));
         log.seeded();
@@ -396,7 +396,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let text = written(folder.path());
         let read = Decisions::load(&folder.path().join(FILE)).expect("a log");
-        assert_eq!(read.settings, settings(0));
+        assert_eq!(read.settings, settings(None));
         let told: Vec<(u64, String)> = text
             .lines()
             .skip(1)
@@ -434,11 +434,11 @@ mod tests {
     fn a_log_from_a_checkpoint_spares_the_one_before() {
         let folder = tempfile::tempdir().expect("a folder");
         let before = written(folder.path());
-        let mut log = DecisionLog::create(folder.path(), settings(130)).expect("a log");
+        let mut log = DecisionLog::create(folder.path(), settings(Some(130))).expect("a log");
         log.had(130, &keyframe(18, Split::Train));
         log.end(260).expect("room on the disk");
         let read = Decisions::load(&folder.path().join("decisions-from-130.jsonl")).expect("a log");
-        assert_eq!((read.settings.from_step, read.pushed().count()), (130, 1));
+        assert_eq!((read.settings.from_step, read.pushed().count()), (Some(130), 1));
         assert_eq!(std::fs::read_to_string(folder.path().join(FILE)).expect("the log"), before);
     }
 

@@ -69,16 +69,18 @@ impl Replay {
         Ok(data)
     }
 
-    /// Refuses a model that is not where the log begins.
-    pub(crate) fn check_start(&self, n_taken: u64) -> Result<(), BadArgument> {
+    /// Refuses a model that is not where the log begins; `from_step`: updates made before, where it goes on from a checkpoint.
+    pub(crate) fn check_start(&self, from_step: Option<u64>) -> Result<(), BadArgument> {
         let name = self.name();
-        match self.decisions.settings.from_step {
-            from if from == n_taken => Ok(()),
-            0 => Err(BadArgument(format!("{name} begins at the first step: leave out --resume"))),
-            from if n_taken == 0 => Err(BadArgument(format!(
-                "{name} is of a run that went on at step {from}: name the folder of that checkpoint with --resume"
+        match (self.decisions.settings.from_step, from_step) {
+            (log, here) if log == here => Ok(()),
+            (None, _) => Err(BadArgument(format!("{name} begins at the first step: leave out --resume"))),
+            (Some(log), None) => Err(BadArgument(format!(
+                "{name} is of a run that went on at step {log}: name the folder of that checkpoint with --resume"
             ))),
-            from => Err(BadArgument(format!("{name} goes on at step {from}, the checkpoint is of step {n_taken}"))),
+            (Some(log), Some(here)) => {
+                Err(BadArgument(format!("{name} goes on at step {log}, the checkpoint is of step {here}")))
+            }
         }
     }
 

@@ -118,7 +118,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         data: args.record.as_deref().or(args.from.as_deref()),
         adapter: gpu.describe(),
         scale: rig.train.scale,
-        from_step: 0,
+        from_step: None,
         options,
     };
     let decisions = DecisionLog::create(&out, Settings::new(about))?;

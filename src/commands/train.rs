@@ -104,7 +104,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             Resumed { kind, method, options, rest: data.keyframes.clone() }
         }
     };
-    let from_step = method.n_taken()?;
+    let from_step = checkpoint.is_some().then(|| method.n_taken()).transpose()?;
     if let Some(replay) = &replay {
         replay.check_start(from_step)?;
         replay.check_adapter(&gpu.describe());
@@ -127,7 +127,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut decisions = DecisionLog::create(&out, Settings::new(about))?;
     let is_new = |keyframe: &Arc<Keyframe>| rest.iter().any(|new| Arc::ptr_eq(new, keyframe));
     for keyframe in data.keyframes.iter().filter(|keyframe| !is_new(keyframe)) {
-        decisions.had(from_step, keyframe);
+        decisions.had(from_step.unwrap_or_default(), keyframe);
     }
     let session = Session::new(gpu, method, evaluators, limits, Tell::of_command(args.json))
         .with_checkpoints(Checkpoints::new(&out, args.checkpoints))
