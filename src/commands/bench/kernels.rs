@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 use trainer::gpu::GpuOptions;
 use trainer::splat::arrays::SplatArrays;
-use trainer::splat::bench::{Repeats, time_kernels};
+use trainer::splat::bench::{Eye, Repeats, time_kernels};
 use trainer::splat::cloud::{load_cloud_npz, synthetic_cloud};
 
 /// More splats than any rig file may ask for.
@@ -45,6 +45,9 @@ pub(crate) struct Args {
     /// Pictures and steps timed, 1 to 10000; the median counts [default: 30; without a GPU 3]
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     repeats: Option<u32>,
+    /// Put the camera into the middle of the cloud, where it sees a part of the splats
+    #[arg(long)]
+    inside: bool,
     /// Print the GPU time of each pass of a step
     #[arg(long)]
     profile: bool,
@@ -98,6 +101,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         .as_ref()
         .map_or_else(|| asked.iter().map(|n_splats| *n_splats as usize).collect(), |cloud| vec![cloud.n_splats()]);
     let n_repeats = args.repeats.unwrap_or(usual.repeats) as usize;
+    let eye = if args.inside { Eye::Inside } else { Eye::Outside };
     let mut out = std::io::stdout().lock();
     for (place, Size(size)) in sizes.iter().enumerate() {
         for n_splats in &counts {
@@ -120,7 +124,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
                 n_timed: n_repeats,
                 n_row: 3 * n_repeats,
             };
-            let figures = time_kernels(&gpu, cloud, *size, repeats).with_context(|| {
+            let figures = time_kernels(&gpu, cloud, *size, eye, repeats).with_context(|| {
                 format!("{}x{} pixels and {n_splats} splats: try fewer --splats or a smaller --size", size[0], size[1])
             })?;
             let row = Row {

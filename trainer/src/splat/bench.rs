@@ -1,6 +1,6 @@
 //! Times drawing and learning on a given cloud: one picture, one step, pass by pass.
 //!
-//! The setting is that of the peer's benchmark: a pinhole camera at (0, 0, -3.2) looking along z with a focal length of
+//! The setting is that of the peer's benchmark: a pinhole camera at [`Eye::Outside`] looking along z with a focal length of
 //! 0.9 image widths, a target of uniform noise, L1 loss, every splat updated in every step.
 
 use super::arrays::SplatArrays;
@@ -42,6 +42,24 @@ pub struct KernelFigures {
     pub peak_bytes: u64,
     /// GPU time of each pass of one step; empty without timestamps.
     pub passes: Vec<PassTiming>,
+}
+
+/// Where the camera stands on the z axis, metres.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Eye {
+    /// -3.2, as the peer's: it sees the whole cloud.
+    Outside,
+    /// 0: within the cloud, as in a room, it sees a part.
+    Inside,
+}
+
+impl Eye {
+    fn z_m(self) -> f64 {
+        match self {
+            Self::Outside => -3.2,
+            Self::Inside => 0.0,
+        }
+    }
 }
 
 /// How often things are repeated.
@@ -88,9 +106,10 @@ pub fn time_kernels(
     gpu: &Arc<Gpu>,
     cloud: &SplatArrays,
     size_px: [u32; 2],
+    eye: Eye,
     repeats: Repeats,
 ) -> Result<KernelFigures, Error> {
-    let mut bench = KernelBench::new(gpu.clone(), cloud, size_px)?;
+    let mut bench = KernelBench::new(gpu.clone(), cloud, size_px, eye)?;
     bench.fit()?;
     let mut passes = Passes::default();
     let mean_rgb = bench.mean_rgb(&mut passes)?;
@@ -123,7 +142,7 @@ pub fn time_kernels(
 }
 
 impl KernelBench {
-    fn new(gpu: Arc<Gpu>, cloud: &SplatArrays, size_px: [u32; 2]) -> Result<Self, Error> {
+    fn new(gpu: Arc<Gpu>, cloud: &SplatArrays, size_px: [u32; 2], eye: Eye) -> Result<Self, Error> {
         let draw = DrawPipelines::new(&gpu)?;
         let learn = LearnPipelines::new(&gpu)?;
         let n_splats =
@@ -133,7 +152,7 @@ impl KernelBench {
         let n_pixels = size_px[0] * size_px[1];
         let focal_px = [0.9 * f64::from(size_px[0]); 2];
         let camera = Camera {
-            world_from_camera: Transform::translation(0.0, 0.0, -3.2),
+            world_from_camera: Transform::translation(0.0, 0.0, eye.z_m()),
             size_px,
             focal_px,
             principal_px: size_px.map(|size| f64::from(size) / 2.0),
@@ -342,7 +361,7 @@ mod tests {
     fn slopes(unordered: bool) -> Vec<f64> {
         let gpu = Gpu::open(&GpuOptions { float_atomics: true, ..GpuOptions::default() }).unwrap();
         let cloud = synthetic_cloud(3000, 0);
-        let mut bench = KernelBench::new(gpu.clone(), &cloud, [112, 96]).unwrap();
+        let mut bench = KernelBench::new(gpu.clone(), &cloud, [112, 96], Eye::Outside).unwrap();
         bench.fit().unwrap();
         let mut passes = Passes::default();
         let view = bench.list_slopes(&mut passes);
