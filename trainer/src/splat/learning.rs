@@ -352,6 +352,20 @@ fn the_length_of_submits_changes_no_bit() {
     assert!(learned(train_in_long_submits) == learned(train_one_by_one));
 }
 
+/// Nor where a trial ends, and held-back images join in.
+#[test]
+fn the_length_of_submits_changes_no_bit_of_a_trial() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = n_keyframes(&gpu, 36, true);
+    let learned = |train: fn(&mut SplatTrainer, u64)| {
+        let mut trainer = trying_a_lens(&keyframes, gpu.clone(), 300);
+        train(&mut trainer, 790);
+        assert_eq!((trainer.trials().len(), trainer.n_taken().unwrap()), (1, 790 + 250));
+        (trainer.arrays().unwrap(), trainer.camera_fixes().unwrap())
+    };
+    assert!(learned(train_in_long_submits) == learned(train_one_by_one));
+}
+
 /// A submit whose intersections found no room is done again, and the one sent behind it is not counted twice.
 #[test]
 fn a_buffer_that_was_too_small_changes_no_bit() {

@@ -596,10 +596,15 @@ impl SplatTrainer {
 
     /// Begins, turns and ends trials of what may be learned about cameras.
     fn try_when_due(&mut self) -> Result<(), Error> {
-        if matches!(self.trials.due(self.step), Due::Nothing) {
-            return Ok(());
+        // What one leads to is due at once, not after a submit of whatever length.
+        while !matches!(self.trials.due(self.step), Due::Nothing) {
+            self.settle()?;
+            self.try_what_is_due()?;
         }
-        self.settle()?;
+        Ok(())
+    }
+
+    fn try_what_is_due(&mut self) -> Result<(), Error> {
         match self.trials.due(self.step) {
             Due::Nothing => {}
             Due::Begin => {
