@@ -307,7 +307,7 @@ impl Decisions {
 
     fn parse(text: &str) -> anyhow::Result<Self> {
         let wrong = |reason: String| anyhow::Error::new(BadArgument(reason));
-        let mut lines = text.split_inclusive('\n').zip(1..).peekable();
+        let mut lines = text.split_inclusive('\n').zip(1..);
         let first = lines.next().map_or("", |(line, _)| line);
         let about: serde_json::Value = serde_json::from_str(first).map_err(|e| wrong(format!("line 1: {e}")))?;
         match about["version"].as_u64() {
@@ -317,7 +317,7 @@ impl Decisions {
         }
         let settings = serde_json::from_value(about).map_err(|e| wrong(format!("line 1: {e}")))?;
         let mut entries: Vec<Entry> = Vec::new();
-        while let Some((line, number)) = lines.next() {
+        for (line, number) in lines {
             if !line.ends_with('\n') {
                 break; // A line that was being written when the run was killed.
             }
