@@ -43,15 +43,16 @@ impl Checkpoints {
         (!every.is_zero()).then(|| Self { path: folder.join(FILE), every, last: Instant::now(), writing: None })
     }
 
-    /// Begins one when it is due and the one before is written. A disk that refuses one does not stop training.
-    pub(crate) fn when_due(&mut self, method: &mut dyn Method, seconds: f64) -> Result<(), trainer::Error> {
+    /// Begins one when it is due and the one before is written, and says so. A disk that refuses one does not stop training.
+    pub(crate) fn when_due(&mut self, method: &mut dyn Method, seconds: f64) -> Result<bool, trainer::Error> {
         if self.last.elapsed() < self.every || self.writing.as_ref().is_some_and(|thread| !thread.is_finished()) {
-            return Ok(());
+            return Ok(false);
         }
         if let Err(error) = self.wait() {
             log::warn!("no checkpoint, training goes on: {error:#}");
         }
-        self.begin(method, seconds)
+        self.begin(method, seconds)?;
+        Ok(true)
     }
 
     /// Begins one of the state as it is now, after the one under way.

@@ -52,6 +52,13 @@ pub(crate) enum Purpose {
     Scoring,
 }
 
+/// Which images are taken.
+struct Selection {
+    list: Option<KeyframeList>,
+    holdout: Option<Holdout>,
+    scale: Option<f64>,
+}
+
 impl Data {
     /// Reads a folder, or a recording through the join.
     pub(crate) fn load(
@@ -63,11 +70,35 @@ impl Data {
     ) -> anyhow::Result<Self> {
         let list = args.keyframes.as_deref().map(KeyframeList::load).transpose()?;
         let holdout = args.holdout.as_deref().map(Holdout::from_argument).transpose()?;
+        Self::selected(path, Selection { list, holdout, scale: args.scale }, purpose, overrides, quiet)
+    }
+
+    /// Reads the keyframes of a list, with their images shrunk to a share of their size.
+    pub(crate) fn of_list(
+        path: &Path,
+        list: KeyframeList,
+        scale: f64,
+        overrides: &[Override],
+        quiet: bool,
+    ) -> anyhow::Result<Self> {
+        let selection = Selection { list: Some(list), holdout: None, scale: Some(scale) };
+        Self::selected(path, selection, Purpose::Training, overrides, quiet)
+    }
+
+    fn selected(
+        path: &Path,
+        selection: Selection,
+        purpose: Purpose,
+        overrides: &[Override],
+        quiet: bool,
+    ) -> anyhow::Result<Self> {
+        let Selection { list, holdout, scale } = selection;
         let is_recording = path.extension().is_some_and(|ending| ending == RECORDING_ENDING);
         let mut data = if is_recording {
-            Self::from_recording(path, list, overrides.iter().cloned().chain(args.overrides()).collect(), quiet)?
+            let scale = scale.map(|scale| Override::new("train.scale", scale));
+            Self::from_recording(path, list, overrides.iter().cloned().chain(scale).collect(), quiet)?
         } else {
-            Self::from_folder(path, &holdout.clone().unwrap_or_default(), args.scale.unwrap_or(1.0), list, quiet)?
+            Self::from_folder(path, &holdout.clone().unwrap_or_default(), scale.unwrap_or(1.0), list, quiet)?
         };
         if let (true, Some(holdout)) = (is_recording, &holdout) {
             data.hold_out(holdout)?;
@@ -182,13 +213,6 @@ impl Data {
             }
         }
         Ok(())
-    }
-}
-
-impl DataArgs {
-    /// The key of the rig file that a flag stands for.
-    fn overrides(&self) -> Option<Override> {
-        self.scale.map(|scale| Override::new("train.scale", scale))
     }
 }
 

@@ -141,7 +141,7 @@ impl Live {
                 pending.fail("nothing was seen yet");
                 continue;
             }
-            match self.session.method.render(&pending.request) {
+            match self.session.render(&pending.request) {
                 Ok(picture) => pending.deliver(picture),
                 Err(error) => pending.fail(&error.to_string()),
             }

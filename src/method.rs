@@ -21,8 +21,12 @@ impl Kind {
     /// The kind that a rig file names.
     pub(crate) fn of_rig(rig: &Rig) -> Result<Self, BadArgument> {
         let name = &rig.train.method;
-        clap::ValueEnum::from_str(name, false)
-            .map_err(|_| BadArgument(format!("train.method = {name:?}: must be \"splat\"")))
+        Self::named(name).ok_or_else(|| BadArgument(format!("train.method = {name:?}: must be \"splat\"")))
+    }
+
+    /// The kind of a name.
+    pub(crate) fn named(name: &str) -> Option<Self> {
+        clap::ValueEnum::from_str(name, false).ok()
     }
 
     /// Its name in files and on the command line.

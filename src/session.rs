@@ -2,6 +2,7 @@
 
 use crate::bench::statistics::median;
 use crate::checkpoints::Checkpoints;
+use crate::decisions::DecisionLog;
 use crate::evaluate::{Evaluator, ImageScores, Scores};
 use crate::marks::Marks;
 use crate::{print, run_folder};
@@ -12,10 +13,12 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::gpu::{Gpu, PassTiming};
-use trainer::{Keyframe, Method, Part, Progress, Split};
+use trainer::{Keyframe, Method, Part, Picture, Progress, RenderRequest, Split};
 
 /// Steps that a profile is the median of.
 const N_PROFILED: usize = 21;
+/// After large buffers were let go of, drivers are slow for a while.
+const BEFORE_PROFILE: Duration = Duration::from_millis(700);
 /// Points of the PSNR curve that are kept; past them every second one goes.
 const MAX_HISTORY: usize = 512;
 
@@ -60,8 +63,9 @@ impl Tell {
 
 /// A model in training.
 pub(crate) struct Session {
-    pub(crate) method: Box<dyn Method>,
+    method: Box<dyn Method>,
     checkpoints: Option<Checkpoints>,
+    decisions: Option<DecisionLog>,
     gpu: Arc<Gpu>,
     /// At the marks.
     evaluator: Evaluator,
@@ -174,6 +178,7 @@ impl Session {
         Self {
             method,
             checkpoints: None,
+            decisions: None,
             gpu,
             evaluator: evaluators.at_marks,
             most_at_marks: evaluators.most_at_marks,
@@ -199,6 +204,11 @@ impl Session {
     /// Tells at the end what each pass of a step takes, if asked to.
     pub(crate) fn with_profile(self, profiles: bool) -> Self {
         Self { profiles, ..self }
+    }
+
+    /// Writes down from now on what depends on the clock.
+    pub(crate) fn with_decisions(self, decisions: DecisionLog) -> Self {
+        Self { decisions: Some(decisions), ..self }
     }
 
     /// Goes on where earlier runs had trained for so long; marks they reached are not told again.
@@ -228,14 +238,39 @@ impl Session {
         if keyframe.split == Split::Test {
             self.tests.push_back(keyframe.clone());
         }
-        Ok(self.method.push(keyframe.clone())?)
+        self.method.push(keyframe.clone())?;
+        if let Some(decisions) = &mut self.decisions {
+            decisions.pushed(self.method.n_taken()?, keyframe);
+        }
+        Ok(())
     }
 
     /// Takes a keyframe back.
     pub(crate) fn remove(&mut self, camera: &str, stamp: kinematics::Stamp) -> anyhow::Result<()> {
         self.tests.retain(|test| test.camera.as_ref() != camera || test.stamp != stamp);
         self.newest_psnr.retain(|(of, nanos), _| of != camera || *nanos != stamp.0);
-        Ok(self.method.remove(camera, stamp)?)
+        self.method.remove(camera, stamp)?;
+        if let Some(decisions) = &mut self.decisions {
+            decisions.removed(self.method.n_taken()?, camera, stamp);
+        }
+        Ok(())
+    }
+
+    /// Gives the keyframes so far their splats.
+    pub(crate) fn seed(&mut self) -> anyhow::Result<()> {
+        self.note_look();
+        Ok(self.method.seed()?)
+    }
+
+    /// Draws a picture.
+    pub(crate) fn render(&mut self, request: &RenderRequest) -> Result<Picture, trainer::Error> {
+        self.note_look();
+        self.method.render(request)
+    }
+
+    /// Waits for what is queued, and says how many updates were made in all, those of trials included.
+    pub(crate) fn n_taken(&mut self) -> anyhow::Result<u64> {
+        Ok(self.method.n_taken()?)
     }
 
     /// Whether a limit was reached.
@@ -247,10 +282,16 @@ impl Session {
     /// Trains a slice of at most `n_most` steps, and evaluates when a mark was reached.
     pub(crate) fn step(&mut self, n_most: u64) -> anyhow::Result<u64> {
         let left = self.limits.steps.map_or(u64::MAX, |steps| steps.saturating_sub(self.method.progress().step));
+        if let Some(decisions) = &mut self.decisions {
+            decisions.begun();
+        }
         let n = self.method.step(n_most.min(left))?;
         let seconds = self.secs();
-        if let Some(checkpoints) = &mut self.checkpoints {
-            checkpoints.when_due(self.method.as_mut(), seconds)?;
+        if let Some(checkpoints) = &mut self.checkpoints
+            && checkpoints.when_due(self.method.as_mut(), seconds)?
+            && let Some(decisions) = &mut self.decisions
+        {
+            decisions.checkpoint(self.method.n_taken()?);
         }
         if self.marks.reached(self.secs()) {
             self.tell_mark()?;
@@ -263,6 +304,7 @@ impl Session {
     pub(crate) fn refresh_psnr(&mut self) -> anyhow::Result<()> {
         let Some(oldest) = self.tests.pop_front() else { return Ok(()) };
         self.tests.push_back(oldest.clone());
+        self.note_look();
         let quick = Evaluator::psnr_only();
         let scores = quick.score(self.method.as_mut(), &oldest)?;
         self.newest_psnr.insert((scores.camera, scores.stamp_nanos), scores.psnr);
@@ -291,6 +333,11 @@ impl Session {
     /// `particulars` are what only this kind of run knows.
     pub(crate) fn finish(mut self, out: &Path, particulars: &impl Serialize) -> anyhow::Result<()> {
         let seconds = self.halt()?;
+        if let Some(decisions) = self.decisions.take()
+            && let Err(error) = decisions.end(self.method.n_taken()?)
+        {
+            log::warn!("{error:#}");
+        }
         // Saved before it is scored: a second Ctrl-C during the scoring loses nothing.
         run_folder::save_model(self.method.as_mut(), out)?;
         if let Some(checkpoints) = &mut self.checkpoints {
@@ -349,6 +396,10 @@ impl Session {
     fn profile(&mut self) -> anyhow::Result<Vec<(&'static str, f64)>> {
         let mut names: Vec<&'static str> = Vec::new();
         let mut by_name: BTreeMap<&'static str, Vec<f64>> = BTreeMap::new();
+        let began = Instant::now();
+        while began.elapsed() < BEFORE_PROFILE {
+            self.method.profile_step()?;
+        }
         for _ in 0..N_PROFILED {
             let mut sums: BTreeMap<&'static str, f64> = BTreeMap::new();
             for PassTiming { name, millis } in self.method.profile_step()? {
@@ -394,6 +445,7 @@ impl Session {
     /// Scores at most `most` test keyframes, off the clock.
     fn score(&mut self, most: usize) -> anyhow::Result<Vec<ImageScores>> {
         self.gpu.wait()?;
+        self.note_look();
         let before = Instant::now();
         let stride = self.tests.len().div_ceil(most).max(1);
         let tests: Vec<Arc<Keyframe>> = self.tests.iter().step_by(stride).cloned().collect();
@@ -433,6 +485,13 @@ impl Session {
         }
         self.told.push(eval);
         Ok(())
+    }
+
+    /// What is drawn makes splats of keyframes that wait for theirs.
+    fn note_look(&mut self) {
+        if let Some(decisions) = &mut self.decisions {
+            decisions.seeded();
+        }
     }
 
     fn note_psnr(&mut self) {

@@ -64,6 +64,24 @@ fn assert_chart(folder: &Path, name: &str) {
 }
 
 #[test]
+fn kernels_tell_what_order_and_untouched_splats_cost() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let args = ["kernels", "--size", "64x48", "--splats", "2000", "--repeats", "1", "--inside", "--json"];
+    let row = &events(folder.path(), &args)[0];
+    for column in ["render_ms", "step_ms", "step_touched_ms", "step_unordered_ms"] {
+        assert!(row[column].as_f64() > Some(0.0), "{column}: {row}");
+    }
+    assert!(row["touched"].as_u64().is_some_and(|n| (50..1500).contains(&n)), "it sees a part: {row}");
+    let plain = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
+        .args([&["bench"], &args[..]].concat())
+        .env("FIELDRIG_GPU_FEATURES", "none")
+        .output()
+        .expect("fieldrig starts");
+    let row: Value = serde_json::from_slice(&plain.stdout).expect("a JSON object");
+    assert!(row["step_unordered_ms"].is_null() && row["step_touched_ms"].as_f64() > Some(0.0), "{row}");
+}
+
+#[test]
 fn a_curve_is_drawn_with_a_peer_and_goes_on_where_it_stopped() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();

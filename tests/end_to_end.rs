@@ -209,6 +209,61 @@ fn an_interrupted_run_saves_model_and_recording() {
     assert!(replayed.status.success(), "{}", String::from_utf8_lossy(&replayed.stderr));
 }
 
+/// In real time the machine's speed decides what is learned when; the log of that gives the same model again.
+#[test]
+fn a_run_in_real_time_is_repeated_by_its_log() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    rig_file(folder);
+    let rig = std::fs::read_to_string(folder.join("rig.toml")).expect("a rig file");
+    let live = rig.replace("lockstep = true", "lockstep = false");
+    assert_ne!(live, rig);
+    // Small enough that keyframes have to go.
+    std::fs::write(folder.join("rig.toml"), live + "[join]\nmax_keyframes = 10\n").expect("room on the disk");
+    // Images that the machine is too slow for are a loss (3).
+    let done = |args: &[&str], codes: &[i32]| -> Value {
+        let output = fieldrig(folder, args);
+        let told = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.code().is_some_and(|code| codes.contains(&code)), "{args:?}: {told}");
+        let stdout = String::from_utf8(output.stdout).expect("stdout is UTF-8");
+        serde_json::from_str(stdout.lines().last().expect("events")).expect("a JSON object a line")
+    };
+    let run = ["run", "rig.toml", "--sim", "--seconds", "5", "--refine", "mount", "--max-splats", "3000"];
+    let outputs = ["--record", "scan.mcap", "--out", "live", "--listen", "127.0.0.1:0", "--json"];
+    let live = done(&[&run[..], &outputs[..]].concat(), &[0, 3]);
+
+    let log = std::fs::read_to_string(folder.join("live/decisions.jsonl")).expect("a log");
+    let entries: Vec<Value> = log.lines().skip(1).map(|line| serde_json::from_str(line).expect("JSON")).collect();
+    let late = entries.iter().filter(|entry| entry.get("push").is_some() && number(entry, "step") > 0.0).count();
+    let gone = entries.iter().filter(|entry| entry.get("remove").is_some()).count();
+    assert!(late > 3 && gone > 0, "{late} came while it learned, {gone} went: {log}");
+
+    let replay = |log: &str, out: &str, codes: &[i32]| {
+        done(&["train", "scan.mcap", "--replay-decisions", log, "--out", out, "--json"], codes)
+    };
+    let again = replay("live/decisions.jsonl", "again", &[0, 3]);
+    assert_eq!((&again["checkpoint_sha256"], &again["steps"]), (&live["checkpoint_sha256"], &live["steps"]));
+    let log_again = std::fs::read_to_string(folder.join("again/decisions.jsonl")).expect("a log");
+    assert!(log_again == log, "the repetition decided otherwise: {log_again}");
+
+    // Killed in the middle of a line: what was whole is repeated.
+    std::fs::write(folder.join("cut.jsonl"), &log[..log.len() / 2]).expect("room on the disk");
+    let cut = replay("cut.jsonl", "cut", &[3]);
+    assert!(cut["steps"].as_u64() <= live["steps"].as_u64());
+    let refused = |log: String, words: &str| {
+        std::fs::write(folder.join("changed.jsonl"), log).expect("room on the disk");
+        let output = fieldrig(folder, &["train", "scan.mcap", "--replay-decisions", "changed.jsonl", "--out", "no"]);
+        let told = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.code() == Some(4) && told.contains(words), "{told}");
+        assert!(!folder.join("no").exists(), "what is refused leaves nothing behind");
+    };
+    let pushed = &entries[1]["push"];
+    let stamp = number(pushed, "stamp_nanos").to_string();
+    refused(log.replace(&stamp, "7"), "names image 7 of camera \"wrist\", which scan.mcap does not have");
+    let fingerprint = pushed["fingerprint"].as_str().expect("a fingerprint");
+    refused(log.replace(fingerprint, "0123"), &format!("image {stamp} of camera \"wrist\" has other pixels"));
+}
+
 /// A replay that leaves nothing to train on ends by itself, and says what was amiss.
 #[test]
 fn a_replay_without_training_keyframes_ends_with_a_reason() {

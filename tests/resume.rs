@@ -110,6 +110,38 @@ fn tells_what_it_cannot_go_on_from(folder: &Path) {
 }
 
 #[test]
+fn what_the_clock_ended_is_repeated_by_its_log() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    std::fs::create_dir(folder.join("data")).unwrap();
+    dataset(&folder.join("data"));
+    let settings =
+        ["--max-splats", "600", "--seed", "3", "--scale", "0.5", "--holdout", "5", "--refine", "image-poses"];
+    let timed = done(folder, &[&["--seconds", "1", "--out", "timed"], &settings[..]].concat());
+    let again = done(folder, &["--replay-decisions", "timed/decisions.jsonl", "--out", "again"]);
+    assert!(timed["steps"].as_u64() > Some(0));
+    assert_eq!((&again["checkpoint_sha256"], &again["steps"]), (&timed["checkpoint_sha256"], &timed["steps"]));
+
+    // What went on from a checkpoint is repeated from it, and from nothing else.
+    let both =
+        done(folder, &["--resume", "timed", "--seconds", "2", "--scale", "0.5", "--holdout", "5", "--out", "both"]);
+    assert_ne!(both["checkpoint_sha256"], timed["checkpoint_sha256"]);
+    let log = format!("both/decisions-from-{}.jsonl", timed["steps"]);
+    let replay = ["--replay-decisions", &log, "--out", "both again"];
+    let both_again = done(folder, &[&["--resume", "timed"], &replay[..]].concat());
+    assert_eq!(both_again["checkpoint_sha256"], both["checkpoint_sha256"]);
+    let told = |args: &[&str]| refused(&train(folder, &[args, &["--out", "x"]].concat()).output().unwrap(), 2);
+    assert!(told(&["--replay-decisions", &log]).contains("with --resume"));
+    assert!(told(&["--replay-decisions", &log, "--resume", "both"]).contains("the checkpoint is of step"));
+    assert!(told(&["--replay-decisions", "timed/decisions.jsonl", "--resume", "timed"]).contains("leave out --resume"));
+    for flag in ["--seed", "--seconds", "--steps", "--holdout", "--scale", "--max-splats"] {
+        let told = told(&["--replay-decisions", "timed/decisions.jsonl", flag, "1"]);
+        assert!(told.contains(flag), "{told}");
+    }
+    assert!(!folder.join("x").exists(), "what is refused leaves nothing behind");
+}
+
+#[test]
 fn a_run_that_is_killed_again_and_again_ends_with_the_same_bits() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();

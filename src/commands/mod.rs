@@ -36,6 +36,10 @@ pub(crate) fn run(command: Command) -> anyhow::Result<Exit> {
 
 /// Opens the GPU; `FIELDRIG_GPU_FEATURES=none` does without everything optional.
 fn open_gpu() -> Result<Arc<Gpu>, trainer::Error> {
+    open_gpu_with(GpuOptions::default())
+}
+
+fn open_gpu_with(options: GpuOptions) -> Result<Arc<Gpu>, trainer::Error> {
     let optional_features = std::env::var_os("FIELDRIG_GPU_FEATURES").is_none_or(|value| value != "none");
-    Gpu::open(&GpuOptions { optional_features, ..GpuOptions::default() })
+    Gpu::open(&GpuOptions { optional_features, ..options })
 }

@@ -2,6 +2,7 @@
 
 use crate::checkpoints::{CheckpointArgs, Checkpoints};
 use crate::config::{ArmDriver, Override, Rig};
+use crate::decisions::{About, DecisionLog, Settings};
 use crate::evaluate::Evaluator;
 use crate::exit::{self, BadArgument, Exit, LackOfEvidence};
 use crate::feed::{Feed, Input};
@@ -112,7 +113,16 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let cameras = args.training.cameras(true, Refine::None)?;
     let count = args.training.count(HowMany::ToCap);
     let options = SplatOptions { cameras, count, ..method::options(&rig.train, args.steps)? };
-    let method = kind.start(gpu.clone(), options)?;
+    let method = kind.start(gpu.clone(), options.clone())?;
+    let about = About {
+        method: kind.name(),
+        data: args.record.as_deref().or(args.from.as_deref()),
+        adapter: gpu.describe(),
+        scale: rig.train.scale,
+        from_step: None,
+        options,
+    };
+    let decisions = DecisionLog::create(&out, Settings::new(about))?;
     let evaluators = Evaluators {
         at_marks: Evaluator::psnr_only(),
         most_at_marks: MOST_SCORED_AT_MARKS,
@@ -120,7 +130,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     };
     let limits = Limits { seconds: args.seconds, steps: args.steps };
     let session = Session::new(gpu, method, evaluators, limits, Tell::of_command(args.json))
-        .with_checkpoints(Checkpoints::new(&out, args.checkpoints));
+        .with_checkpoints(Checkpoints::new(&out, args.checkpoints))
+        .with_decisions(decisions);
     let options = LiveOptions { pace, method_name: kind.name(), start_keyframes: rig.join.start_keyframes, notes };
 
     let mut live = Live::new(session, feed, hub, options);

@@ -2,19 +2,22 @@
 
 use crate::checkpoints::{self, CheckpointArgs, Checkpoints};
 use crate::data::{Data, DataArgs, Purpose};
+use crate::decisions::{About, DecisionLog, Settings};
 use crate::evaluate::Evaluator;
 use crate::exit::{self, Exit};
 use crate::method::{self, Resumed};
 use crate::print;
+use crate::replay::Replay;
 use crate::run_folder;
-use crate::session::{Evaluators, Session, Tell};
+use crate::session::{Evaluators, Limits, Session, Tell};
 use crate::stop::Stop;
 use crate::training;
 use crate::training_args::TrainingArgs;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Instant;
-use trainer::Split;
+use trainer::{Keyframe, Split};
 
 /// Length of a training where no flag says.
 const USUAL_SECONDS: f64 = 120.0;
@@ -29,6 +32,10 @@ pub(crate) struct Args {
     /// Go on from the checkpoint that an earlier run left in this folder, with the same data and its settings
     #[arg(long, value_name = "FOLDER", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "count", "plan_steps"])]
     resume: Option<PathBuf>,
+    /// Repeat what the clock decided in an earlier run, and get the same model: with the settings of the log that it left
+    /// (decisions.jsonl) and on the recording or data it had
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "count", "plan_steps", "seconds", "steps", "holdout", "keyframes", "scale"])]
+    replay_decisions: Option<PathBuf>,
     /// Stop after S seconds of training, those before --resume included; loading and scoring do not count [default: 120, unless --steps is given]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
@@ -72,7 +79,11 @@ struct Particulars<'a> {
 /// Loads, trains until a limit or Ctrl-C, scores at the marks, saves.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let started = Instant::now();
-    let limits = training::limits(args.seconds, args.steps, USUAL_SECONDS)?;
+    let replay = args.replay_decisions.as_deref().map(Replay::load).transpose()?;
+    let limits = match &replay {
+        Some(_) => Limits::default(),
+        None => training::limits(args.seconds, args.steps, USUAL_SECONDS)?,
+    };
     if let Some(out) = &args.out {
         run_folder::refuse_model(out)?;
     }
@@ -80,17 +91,27 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let checkpoint = args.resume.as_deref().map(checkpoints::read).transpose()?;
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
     let evaluators = Evaluators { at_marks: evaluator.clone(), most_at_marks: usize::MAX, at_end: evaluator };
-    let data = Data::load(&args.data, &args.images, Purpose::Training, &args.training.overrides(), args.json)?;
+    let data = match &replay {
+        Some(replay) => replay.load_data(&args.data, args.json)?,
+        None => Data::load(&args.data, &args.images, Purpose::Training, &args.training.overrides(), args.json)?,
+    };
     let gpu = super::open_gpu()?;
     let Resumed { kind, mut method, options, rest } = match &checkpoint {
         Some(checkpoint) => args.resumed(method::resume(gpu.clone(), checkpoint, &data.keyframes)?),
         None => {
-            let (kind, options) =
-                training::model(&args.training, &data, args.plan_steps.or(args.steps), gpu.is_software())?;
+            let (kind, options) = match &replay {
+                Some(replay) => (replay.kind, replay.decisions.settings.options.clone()),
+                None => training::model(&args.training, &data, args.plan_steps.or(args.steps), gpu.is_software())?,
+            };
             let method = kind.start(gpu.clone(), options.clone())?;
             Resumed { kind, method, options, rest: data.keyframes.clone() }
         }
     };
+    let from_step = checkpoint.is_some().then(|| method.n_taken()).transpose()?;
+    if let Some(replay) = &replay {
+        replay.check_start(from_step)?;
+        replay.check_adapter(&gpu.describe());
+    }
     method.prepare()?;
     let out = run_folder::make(args.out())?;
     run_folder::write_keyframe_list(&out.join("keyframes.txt"), &data.keyframes)?;
@@ -98,11 +119,28 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         rig.write_settled(&out)?;
     }
 
+    let about = About {
+        method: kind.name(),
+        data: Some(&args.data),
+        adapter: gpu.describe(),
+        scale: args.scale(&data, replay.as_ref()),
+        from_step,
+        options: options.clone(),
+    };
+    let mut decisions = DecisionLog::create(&out, Settings::new(about))?;
+    let is_new = |keyframe: &Arc<Keyframe>| rest.iter().any(|new| Arc::ptr_eq(new, keyframe));
+    for keyframe in data.keyframes.iter().filter(|keyframe| !is_new(keyframe)) {
+        decisions.had(from_step.unwrap_or_default(), keyframe);
+    }
     let session = Session::new(gpu, method, evaluators, limits, Tell::of_command(args.json))
         .with_checkpoints(Checkpoints::new(&out, args.checkpoints))
         .with_profile(args.profile)
+        .with_decisions(decisions)
         .going_on_after(checkpoint.map_or(0.0, |checkpoint| checkpoint.seconds));
-    let session = training::drive(session, &rest, &stop)?;
+    let session = match &replay {
+        Some(replay) => replay.drive(session, &rest, &stop)?,
+        None => training::drive(session, &rest, &stop)?,
+    };
 
     let startup_secs = session.clock_started().map_or(0.0, |at| (at - started).as_secs_f64());
     session.finish(
@@ -126,6 +164,13 @@ impl Args {
     fn out(&self) -> Option<&Path> {
         let unfinished = || self.resume.as_deref().filter(|folder| run_folder::refuse_model(folder).is_ok());
         self.out.as_deref().or_else(unfinished)
+    }
+
+    /// Share of their size that images were shrunk to.
+    fn scale(&self, data: &Data, replay: Option<&Replay>) -> f64 {
+        let of_rig = data.rig.as_ref().map(|rig| rig.train.scale);
+        let of_log = replay.map(|replay| replay.decisions.settings.scale);
+        of_rig.or(of_log).or(self.images.scale).unwrap_or(1.0)
     }
 
     /// Says what is not as the caller may expect.

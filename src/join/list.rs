@@ -90,11 +90,28 @@ impl KeyframeList {
     }
 }
 
+impl FromIterator<(String, Stamp, Split)> for KeyframeList {
+    fn from_iter<T: IntoIterator<Item = (String, Stamp, Split)>>(keyframes: T) -> Self {
+        let place = |split| SPLITS.iter().position(|(known, _)| *known == split).unwrap_or_default();
+        Self(keyframes.into_iter().map(|(camera, stamp, split)| ((camera, stamp.0), place(split))).collect())
+    }
+}
+
+/// The name of a split in files.
+pub(crate) fn split_name(split: Split) -> &'static str {
+    SPLITS.iter().find(|(known, _)| *known == split).map_or("train", |(_, name)| name)
+}
+
+/// The split of a name in files.
+pub(crate) fn split_named(name: &str) -> Option<Split> {
+    SPLITS.iter().find(|(_, known)| *known == name).map(|(split, _)| *split)
+}
+
 /// The text of a `keyframes.txt`.
 pub(crate) fn text_of<'a>(keyframes: impl Iterator<Item = &'a Arc<Keyframe>>) -> String {
     let mut text = String::from("# camera stamp_nanos split\n");
     for keyframe in keyframes {
-        let split = SPLITS.iter().find(|(split, _)| *split == keyframe.split).map_or("train", |(_, name)| name);
+        let split = split_name(keyframe.split);
         writeln!(text, "{} {} {split}", keyframe.camera, keyframe.stamp.0).expect("writing to a String cannot fail");
     }
     text

@@ -15,7 +15,7 @@ mod store;
 mod tests;
 mod waiting;
 
-pub(crate) use list::{KeyframeList, text_of as keyframe_list};
+pub(crate) use list::{KeyframeList, split_name, split_named, text_of as keyframe_list};
 pub(crate) use refusal::{Counts, Refusal, Use};
 
 use crate::config::{self, CameraDriver, Parent, Rig};

@@ -49,6 +49,11 @@ pub trait Method {
     /// A queued update is lost, and done again later, when it turns out that a buffer was too small. When all `n` were
     /// queued the call waits for them, so that [`Method::progress`] is exact; loop until it has reached the step you want.
     fn step(&mut self, n: u64) -> Result<u64, Error>;
+    /// Waits for what is queued, and says how many updates were made in all, those included that a trial took back: unlike
+    /// [`Progress::step`] it never goes back.
+    fn n_taken(&mut self) -> Result<u64, Error>;
+    /// Makes of the keyframes so far what can be drawn without learning, as [`Method::render`] does.
+    fn seed(&mut self) -> Result<(), Error>;
     /// Waits until everything that learning needs is compiled; [`Method::step`] would wait for it otherwise.
     fn prepare(&mut self) -> Result<(), Error>;
     /// Draws a picture; works from the first keyframe on.

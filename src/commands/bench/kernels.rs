@@ -5,8 +5,9 @@ use serde::Serialize;
 use std::io::Write;
 use std::path::PathBuf;
 use std::time::Duration;
+use trainer::gpu::GpuOptions;
 use trainer::splat::arrays::SplatArrays;
-use trainer::splat::bench::{Repeats, time_kernels};
+use trainer::splat::bench::{Eye, Repeats, time_kernels};
 use trainer::splat::cloud::{load_cloud_npz, synthetic_cloud};
 
 /// More splats than any rig file may ask for.
@@ -44,6 +45,9 @@ pub(crate) struct Args {
     /// Pictures and steps timed, 1 to 10000; the median counts [default: 30; without a GPU 3]
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     repeats: Option<u32>,
+    /// Put the camera into the middle of the cloud, where it sees a part of the splats
+    #[arg(long)]
+    inside: bool,
     /// Print the GPU time of each pass of a step
     #[arg(long)]
     profile: bool,
@@ -69,7 +73,13 @@ struct Row {
     n: usize,
     isect: u64,
     render_ms: f64,
+    /// Every splat updated.
     step_ms: f64,
+    /// Only those updated that the view shows.
+    step_touched_ms: f64,
+    touched: u64,
+    /// Sums in any order; null where the adapter adds no floats atomically.
+    step_unordered_ms: Option<f64>,
     render_wall_ms: f64,
     step_wall_ms: f64,
     mean_rgb: [f64; 3],
@@ -91,11 +101,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         .as_ref()
         .map_or_else(|| asked.iter().map(|n_splats| *n_splats as usize).collect(), |cloud| vec![cloud.n_splats()]);
     let n_repeats = args.repeats.unwrap_or(usual.repeats) as usize;
+    let eye = if args.inside { Eye::Inside } else { Eye::Outside };
     let mut out = std::io::stdout().lock();
     for (place, Size(size)) in sizes.iter().enumerate() {
         for n_splats in &counts {
             // A fresh device for each row, so that the peak of memory is the row's own.
-            let gpu = crate::commands::open_gpu()?;
+            let gpu = crate::commands::open_gpu_with(GpuOptions { float_atomics: true, ..GpuOptions::default() })?;
             if place == 0 && counts.first() == Some(n_splats) {
                 log::info!("{}", gpu.describe());
             }
@@ -113,7 +124,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
                 n_timed: n_repeats,
                 n_row: 3 * n_repeats,
             };
-            let figures = time_kernels(&gpu, cloud, *size, repeats).with_context(|| {
+            let figures = time_kernels(&gpu, cloud, *size, eye, repeats).with_context(|| {
                 format!("{}x{} pixels and {n_splats} splats: try fewer --splats or a smaller --size", size[0], size[1])
             })?;
             let row = Row {
@@ -123,6 +134,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
                 isect: figures.n_isect,
                 render_ms: figures.render_millis,
                 step_ms: figures.step_millis,
+                step_touched_ms: figures.step_touched_millis,
+                touched: figures.n_touched,
+                step_unordered_ms: figures.step_unordered_millis,
                 render_wall_ms: figures.render_wall_millis,
                 step_wall_ms: figures.step_wall_millis,
                 mean_rgb: figures.mean_rgb,
@@ -137,9 +151,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
                 writeln!(out, "{}", serde_json::to_string(&row)?)?;
                 continue;
             }
+            let unordered = row
+                .step_unordered_ms
+                .map_or("sums in any order: not offered".into(), |ms| format!("sums in any order {ms:.3} ms"));
             writeln!(
                 out,
-                "{}x{} {:>8} splats {:>9} intersections: picture {:.3} ms, step {:.3} ms (wall {:.3}, {:.3}), mean {:.5?}, peak {} MB",
+                "{}x{} {:>8} splats {:>9} intersections: picture {:.3} ms, step {:.3} ms (wall {:.3}, {:.3}; only the {} splats seen {:.3} ms; {unordered}), mean {:.5?}, peak {} MB",
                 row.w,
                 row.h,
                 row.n,
@@ -148,6 +165,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
                 row.step_ms,
                 row.render_wall_ms,
                 row.step_wall_ms,
+                row.touched,
+                row.step_touched_ms,
                 row.mean_rgb,
                 row.peak_mb
             )?;

@@ -10,13 +10,15 @@ use std::sync::atomic::{AtomicU64, Ordering};
 pub struct GpuOptions {
     /// Whether optional features of the adapter may be used.
     pub optional_features: bool,
+    /// Whether floats may be added atomically: in an order of their own, so nothing that learns wants it.
+    pub float_atomics: bool,
     /// Lowers the largest binding, bytes; for tests of buffer limits.
     pub max_binding_bytes: Option<u64>,
 }
 
 impl Default for GpuOptions {
     fn default() -> Self {
-        Self { optional_features: true, max_binding_bytes: None }
+        Self { optional_features: true, float_atomics: false, max_binding_bytes: None }
     }
 }
 
@@ -48,7 +50,7 @@ impl Gpu {
             ..wgpu::RequestAdapterOptions::default()
         }))
         .map_err(|_| Error::NoAdapter)?;
-        let optional = Optional::of(&adapter, options.optional_features);
+        let optional = Optional::of(&adapter, options);
         let mut limits = adapter.limits();
         if let Some(bytes) = options.max_binding_bytes {
             limits.max_storage_buffer_binding_size = limits.max_storage_buffer_binding_size.min(bytes);

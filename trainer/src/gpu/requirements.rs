@@ -1,5 +1,7 @@
 //! What a kernel may use beyond the WebGPU defaults, and what happens without it.
 
+use super::GpuOptions;
+
 /// Optional abilities of the adapter; every one has a fallback.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Optional {
@@ -9,11 +11,14 @@ pub struct Optional {
     pub subgroup_lanes: Option<u32>,
     /// GPU timestamps for per-pass times; without them only wall time is known.
     pub timestamps: bool,
+    /// Atomic additions of floats; only a measurement wants them, and says where there are none.
+    pub float_atomics: bool,
 }
 
 impl Optional {
-    /// What `adapter` offers; nothing of it when `FIELDRIG_GPU_FEATURES=none` was asked for.
-    pub(super) fn of(adapter: &wgpu::Adapter, allowed: bool) -> Self {
+    /// What `adapter` offers of what may be used; nothing of it when `FIELDRIG_GPU_FEATURES=none` was asked for.
+    pub(super) fn of(adapter: &wgpu::Adapter, options: &GpuOptions) -> Self {
+        let allowed = options.optional_features;
         let features = adapter.features();
         let info = adapter.get_info();
         let same_size = info.subgroup_min_size == info.subgroup_max_size;
@@ -21,6 +26,7 @@ impl Optional {
         Self {
             subgroup_lanes: (allowed && subgroups).then_some(info.subgroup_min_size),
             timestamps: allowed && features.contains(wgpu::Features::TIMESTAMP_QUERY),
+            float_atomics: allowed && options.float_atomics && features.contains(wgpu::Features::SHADER_FLOAT32_ATOMIC),
         }
     }
 
@@ -29,6 +35,7 @@ impl Optional {
         let mut features = wgpu::Features::empty();
         features.set(wgpu::Features::SUBGROUP, self.subgroup_lanes.is_some());
         features.set(wgpu::Features::TIMESTAMP_QUERY, self.timestamps);
+        features.set(wgpu::Features::SHADER_FLOAT32_ATOMIC, self.float_atomics);
         features
     }
 }

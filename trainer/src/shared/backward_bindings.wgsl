@@ -6,9 +6,10 @@
 @group(0) @binding(6) var<storage, read> upstream: array<vec4f>;
 @group(0) @binding(7) var<storage, read> rest: array<vec2f>;
 @group(0) @binding(8) var<storage, read> last: array<u32>;
-@group(0) @binding(9) var<storage, read_write> gradients: array<f32>; // 12 a slot, see `Gradient`
 
 const N_PARTS_OF_GRADIENT = 12u;
+
+#import gradients
 
 // A lane's pixels: their slopes, and what lies around the splat at hand.
 struct Pixels {
@@ -75,9 +76,4 @@ fn finished(sum: Gradient, half: vec4f) -> Gradient {
         vec4f(0.5 * sum.conic.x, sum.conic.y, 0.5 * sum.conic.z, sum.conic.w),
         sum.color,
     );
-}
-
-// Where the gradients of a tile's entry go.
-fn slot_of(entry: u32, tile: Tile) -> u32 {
-    return entries[entry].z + countOneBits(entries[entry].y & ((1u << tile.in_bin) - 1u));
 }

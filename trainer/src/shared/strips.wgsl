@@ -37,12 +37,6 @@ fn max_of_lanes(mine: u32) -> u32 {
     return max(all, subgroupShuffleXor(all, 4u));
 }
 
-fn sum_of_lanes(mine: vec4f) -> vec4f {
-    var all = mine + subgroupShuffleXor(mine, 1u);
-    all += subgroupShuffleXor(all, 2u);
-    return all + subgroupShuffleXor(all, 4u);
-}
-
 // Queues the tile's entries from word `next` on, in order, until the queue might overflow or the list ends: x how many,
 // y the next word.
 fn queue_entries(lane: u32, next: u32, tile: Tile) -> vec2u {

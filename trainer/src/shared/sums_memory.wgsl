@@ -19,7 +19,7 @@ fn hand_in(lane: u32, slot: u32, mine: Gradient) {
     if lane < N_PARTS_OF_GRADIENT {
         var sum = 0.0;
         for (var k = 0u; k < LANES; k++) { sum += wg_lanes[k * N_PARTS_OF_GRADIENT + lane]; }
-        gradients[slot * N_PARTS_OF_GRADIENT + lane] = sum;
+        tell(slot, lane, sum);
     }
     workgroupBarrier(); // All are summed before the next splat is told of.
 }

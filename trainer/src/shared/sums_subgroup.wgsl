@@ -38,5 +38,5 @@ fn hand_in(lane: u32, slot: u32, mine: Gradient) {
         for (var subgroup = 0u; subgroup < LANES / SUBGROUP; subgroup++) { value += wg_parts[subgroup * N_PARTS_OF_GRADIENT + min(part, 11u)]; }
         workgroupBarrier(); // All have read before the next splat is told of.
     }
-    if lane < N_PARTS_OF_GRADIENT { gradients[slot * N_PARTS_OF_GRADIENT + part] = value; }
+    if lane < N_PARTS_OF_GRADIENT { tell(slot, part, value); }
 }

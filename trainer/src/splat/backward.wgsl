@@ -65,7 +65,7 @@ fn backward(tile_ix: u32, lane: u32) {
             if bitcast<u32>(wg_drawn[0].color.w) >= past_last {
                 // All of them are hidden in this tile.
                 for (var at = lane; at < n * N_PARTS_OF_GRADIENT; at += LANES) {
-                    gradients[wg_slots[at / N_PARTS_OF_GRADIENT] * N_PARTS_OF_GRADIENT + at % N_PARTS_OF_GRADIENT] = 0.0;
+                    tell_nothing(wg_slots[at / N_PARTS_OF_GRADIENT], at % N_PARTS_OF_GRADIENT);
                 }
                 continue;
             }

@@ -11,6 +11,7 @@
 
 #import backward_bindings
 #import strips
+#import lane_sums
 #import coverage
 
 const BATCH = 32u;
@@ -79,11 +80,11 @@ fn pass_strip(lane: u32, own: ptr<function, Owned>, strip: Strip, pixels: ptr<fu
 fn hand_in(own: Owned, tile: Tile) {
     if own.entry == 0xffffffffu { return; }
     let sum = finished(own.sum, own.half);
-    let at = slot_of(own.entry, tile) * N_PARTS_OF_GRADIENT;
+    let slot = slot_of(own.entry, tile);
     for (var k = 0u; k < 4u; k++) {
-        gradients[at + k] = sum.place[k];
-        gradients[at + 4u + k] = sum.conic[k];
-        gradients[at + 8u + k] = sum.color[k];
+        tell(slot, k, sum.place[k]);
+        tell(slot, 4u + k, sum.conic[k]);
+        tell(slot, 8u + k, sum.color[k]);
     }
 }
 

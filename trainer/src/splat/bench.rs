@@ -1,11 +1,11 @@
 //! Times drawing and learning on a given cloud: one picture, one step, pass by pass.
 //!
-//! The setting is that of the peer's benchmark: a pinhole camera at (0, 0, -3.2) looking along z with a focal length of
+//! The setting is that of the peer's benchmark: a pinhole camera at [`Eye::Outside`] looking along z with a focal length of
 //! 0.9 image widths, a target of uniform noise, L1 loss, every splat updated in every step.
 
 use super::arrays::SplatArrays;
 use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
-use super::kernels::{DrawPipelines, LearnPipelines};
+use super::kernels::{DrawPipelines, LearnPipelines, UnorderedPipelines};
 use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
 use crate::Error;
@@ -24,8 +24,14 @@ pub struct KernelFigures {
     pub n_isect: u64,
     /// GPU time of a picture from the first pass to the last, milliseconds, median; wall time where there are no timestamps.
     pub render_millis: f64,
-    /// GPU time of a step, milliseconds, median.
+    /// GPU time of a step that updates every splat, milliseconds, median.
     pub step_millis: f64,
+    /// Likewise of one that updates only the splats it sees.
+    pub step_touched_millis: f64,
+    /// Splats it sees.
+    pub n_touched: u64,
+    /// Likewise of one that updates every splat, but whose gradients meet in any order; `None` where the adapter cannot.
+    pub step_unordered_millis: Option<f64>,
     /// Wall time of a picture, mean of a row of them back to back, milliseconds.
     pub render_wall_millis: f64,
     /// Wall time of a step, likewise.
@@ -36,6 +42,24 @@ pub struct KernelFigures {
     pub peak_bytes: u64,
     /// GPU time of each pass of one step; empty without timestamps.
     pub passes: Vec<PassTiming>,
+}
+
+/// Where the camera stands on the z axis, metres.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Eye {
+    /// -3.2, as the peer's: it sees the whole cloud.
+    Outside,
+    /// 0: within the cloud, as in a room, it sees a part.
+    Inside,
+}
+
+impl Eye {
+    fn z_m(self) -> f64 {
+        match self {
+            Self::Outside => -3.2,
+            Self::Inside => 0.0,
+        }
+    }
 }
 
 /// How often things are repeated.
@@ -65,7 +89,16 @@ struct KernelBench {
     supervision: Buffer,
     gains: Buffer,
     rule: Buffer,
+    rule_touched: Buffer,
+    unordered: Option<Unordered>,
     size_px: [u32; 2],
+}
+
+/// What a step without an order of its sums needs.
+struct Unordered {
+    pipelines: UnorderedPipelines,
+    /// 12 f32 a splat.
+    sums: Buffer,
 }
 
 /// Times the kernels on `cloud` at one image size.
@@ -73,9 +106,10 @@ pub fn time_kernels(
     gpu: &Arc<Gpu>,
     cloud: &SplatArrays,
     size_px: [u32; 2],
+    eye: Eye,
     repeats: Repeats,
 ) -> Result<KernelFigures, Error> {
-    let mut bench = KernelBench::new(gpu.clone(), cloud, size_px)?;
+    let mut bench = KernelBench::new(gpu.clone(), cloud, size_px, eye)?;
     bench.fit()?;
     let mut passes = Passes::default();
     let mean_rgb = bench.mean_rgb(&mut passes)?;
@@ -84,20 +118,31 @@ pub fn time_kernels(
     let (step_millis, step_wall_millis) = bench.time(&mut passes, repeats, KernelBench::list_step)?;
     bench.list_step(&mut passes);
     let timings = passes.submit_timed(gpu)?;
+    let peak_bytes = gpu.peak_bytes();
+    let (step_touched_millis, _) = bench.time(&mut passes, repeats, KernelBench::list_step_touched)?;
+    let n_touched = bench.n_touched()?;
+    bench.unordered = bench.new_unordered(&[])?;
+    let step_unordered_millis = match &bench.unordered {
+        Some(_) => Some(bench.time(&mut passes, repeats, KernelBench::list_step_unordered)?.0),
+        None => None,
+    };
     Ok(KernelFigures {
         n_isect,
         render_millis,
         step_millis,
+        step_touched_millis,
+        n_touched,
+        step_unordered_millis,
         render_wall_millis,
         step_wall_millis,
         mean_rgb,
-        peak_bytes: gpu.peak_bytes(),
+        peak_bytes,
         passes: timings,
     })
 }
 
 impl KernelBench {
-    fn new(gpu: Arc<Gpu>, cloud: &SplatArrays, size_px: [u32; 2]) -> Result<Self, Error> {
+    fn new(gpu: Arc<Gpu>, cloud: &SplatArrays, size_px: [u32; 2], eye: Eye) -> Result<Self, Error> {
         let draw = DrawPipelines::new(&gpu)?;
         let learn = LearnPipelines::new(&gpu)?;
         let n_splats =
@@ -107,7 +152,7 @@ impl KernelBench {
         let n_pixels = size_px[0] * size_px[1];
         let focal_px = [0.9 * f64::from(size_px[0]); 2];
         let camera = Camera {
-            world_from_camera: Transform::translation(0.0, 0.0, -3.2),
+            world_from_camera: Transform::translation(0.0, 0.0, eye.z_m()),
             size_px,
             focal_px,
             principal_px: size_px.map(|size| f64::from(size) / 2.0),
@@ -134,6 +179,8 @@ impl KernelBench {
             supervision: gpu.uniform_with("bench.supervision", &<Supervision as bytemuck::Zeroable>::zeroed()),
             gains: gpu.storage_with("bench.gains", bytemuck::cast_slice(&[1.0f32; 4]))?,
             rule: gpu.uniform_with("bench.rule", &rule()),
+            rule_touched: gpu.uniform_with("bench.rule_touched", &Rule { update_all: 0, ..rule() }),
+            unordered: None,
             draw,
             learn,
             splats,
@@ -182,6 +229,29 @@ impl KernelBench {
     }
 
     fn list_step(&self, passes: &mut Passes) {
+        let view = self.list_slopes(passes);
+        view.backward(passes, &self.learn);
+        view.update(passes, &self.learn.update, &self.rule, false);
+        self.list_end(passes);
+    }
+
+    fn list_step_touched(&self, passes: &mut Passes) {
+        let view = self.list_slopes(passes);
+        view.backward(passes, &self.learn);
+        view.update(passes, &self.learn.update, &self.rule_touched, false);
+        self.list_end(passes);
+    }
+
+    /// As [`Self::list_step`] where there are no pipelines without an order.
+    fn list_step_unordered(&self, passes: &mut Passes) {
+        let Some(Unordered { pipelines, sums }) = &self.unordered else { return self.list_step(passes) };
+        let view = self.list_slopes(passes);
+        view.backward_and_update_unordered(passes, pipelines, &self.rule, sums);
+        self.list_end(passes);
+    }
+
+    /// Draws and compares.
+    fn list_slopes(&self, passes: &mut Passes) -> ViewPasses<'_> {
         let view = self.view_passes();
         view.draw(passes, &self.draw);
         view.compare(
@@ -195,9 +265,22 @@ impl KernelBench {
                 ssim: false,
             },
         );
-        view.backward(passes, &self.learn);
-        view.update(passes, &self.learn.update, &self.rule, false);
+        view
+    }
+
+    fn list_end(&self, passes: &mut Passes) {
         passes.dispatch(&self.gpu, &self.learn.advance, 1, &[("status", &self.status)]);
+    }
+
+    fn new_unordered(&self, overrides_of_update: &[(&str, f64)]) -> Result<Option<Unordered>, Error> {
+        let Some(pipelines) = UnorderedPipelines::new(&self.gpu, overrides_of_update)? else { return Ok(None) };
+        let sums = self.gpu.storage("bench.sums", 48 * u64::from(self.splats.n_splats))?;
+        Ok(Some(Unordered { pipelines, sums }))
+    }
+
+    fn n_touched(&self) -> Result<u64, Error> {
+        let tile_counts: Vec<u32> = self.gpu.read(&self.scratch.tile_counts, self.splats.n_splats as usize)?;
+        Ok(tile_counts.iter().filter(|n_tiles| **n_tiles > 0).count() as u64)
     }
 
     fn time(&self, passes: &mut Passes, repeats: Repeats, list: fn(&Self, &mut Passes)) -> Result<(f64, f64), Error> {
@@ -261,5 +344,60 @@ fn rule() -> Rule {
         update_all: 1,
         schedule_start: 0.0,
         unused: 0,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::GpuOptions;
+    use crate::mismatches::Mismatches;
+    use crate::splat::cloud::synthetic_cloud;
+
+    /// Sums of a few hundred f32 terms in another order, against the largest sum: a hundred times their rounding.
+    const OTHER_ORDER: f64 = 1e-5;
+
+    /// The slopes towards all means, scales and constant colors, in place of the parameters.
+    fn slopes(unordered: bool) -> Vec<f64> {
+        let gpu = Gpu::open(&GpuOptions { float_atomics: true, ..GpuOptions::default() }).unwrap();
+        let cloud = synthetic_cloud(3000, 0);
+        let mut bench = KernelBench::new(gpu.clone(), &cloud, [112, 96], Eye::Outside).unwrap();
+        bench.fit().unwrap();
+        let mut passes = Passes::default();
+        let view = bench.list_slopes(&mut passes);
+        if unordered {
+            let unordered = bench.new_unordered(&[("GRADIENTS_ONLY", 1.0)]).unwrap().expect("lavapipe adds atomically");
+            view.backward_and_update_unordered(&mut passes, &unordered.pipelines, &bench.rule, &unordered.sums);
+            passes.submit(&gpu);
+            let sums: Vec<f32> = gpu.read(&unordered.sums, 12 * cloud.n_splats()).unwrap();
+            assert!(sums.iter().all(|sum| *sum == 0.0), "zeros are left for the next step");
+        } else {
+            let update = LearnPipelines::gradients_only(&gpu).unwrap();
+            view.backward(&mut passes, &bench.learn);
+            view.update(&mut passes, &update, &bench.rule, true);
+            passes.submit(&gpu);
+        }
+        assert!(bench.n_touched().unwrap() > 1000);
+        let told = bench.splats.read(&gpu).unwrap();
+        let constant = told.sh.chunks_exact(told.n_coefficients()).map(|coeffs| coeffs[0]);
+        let all = told.means.iter().chain(&told.log_scales).copied().chain(constant);
+        all.flatten().map(f64::from).collect()
+    }
+
+    #[test]
+    fn gradients_that_meet_in_any_order_are_the_same_but_for_rounding() {
+        let (ordered, unordered) = (slopes(false), slopes(true));
+        let third = ordered.len() / 3;
+        let mut wrong = Mismatches::default();
+        for (kind, name) in ["mean", "log scale", "color"].into_iter().enumerate() {
+            let range = kind * third..(kind + 1) * third;
+            let largest = ordered[range.clone()].iter().fold(0.0f64, |most, slope| most.max(slope.abs()));
+            assert!(largest > 0.0);
+            for ix in range {
+                let label = format!("{name} {}", ix % third);
+                wrong.check(label, unordered[ix], ordered[ix], OTHER_ORDER * largest, OTHER_ORDER);
+            }
+        }
+        wrong.assert_none();
     }
 }

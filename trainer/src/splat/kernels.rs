@@ -20,7 +20,10 @@ const PROJECTION: Source = source!("projection");
 const GRADIENT: Source = source!("gradient");
 const TILES: Source = source!("tiles");
 const BINS: Source = source!("bins");
+const GRADIENT_SLOTS: Source = source!("gradients", "gradients_slots");
+const GRADIENT_SUM: Source = source!("gradient_sum", "gradient_sum_slots");
 const SHARED: &[Source] = &[
+    GRADIENT_SUM,
     VIEW,
     STATUS,
     MODEL,
@@ -41,6 +44,7 @@ const SHARED: &[Source] = &[
 ];
 /// What `update` imports where cameras are learned, too.
 const WITH_CAMERA: &[Source] = &[
+    GRADIENT_SUM,
     VIEW,
     STATUS,
     MODEL,
@@ -49,6 +53,19 @@ const WITH_CAMERA: &[Source] = &[
     GRADIENT,
     source!("random"),
     source!("camera_sums", "camera_sums_tree"),
+];
+
+/// What `update` imports where gradients meet unordered.
+const UPDATE_UNORDERED: &[Source] = &[
+    VIEW,
+    STATUS,
+    MODEL,
+    PROJECTION,
+    source!("sh"),
+    GRADIENT,
+    source!("gradient_sum", "gradient_sum_meeting"),
+    source!("random"),
+    source!("camera_sums", "camera_sums_none"),
 ];
 
 /// What the kernels over pixels import.
@@ -60,11 +77,37 @@ macro_rules! blend_sources {
         ]
     };
 }
-const BLEND: &[Source] =
-    blend_sources!(source!("pixels", "pixels_2"), source!("tile_queue"), source!("sums", "sums_subgroup"));
-const BLEND_BY_MEMORY: &[Source] =
-    blend_sources!(source!("pixels", "pixels_2"), source!("tile_queue"), source!("sums", "sums_memory"));
-const BLEND_STRIPS: &[Source] = blend_sources!(source!("pixels", "pixels_4"), source!("strips"));
+const BLEND: &[Source] = blend_sources!(
+    GRADIENT_SLOTS,
+    source!("pixels", "pixels_2"),
+    source!("tile_queue"),
+    source!("sums", "sums_subgroup")
+);
+const BLEND_BY_MEMORY: &[Source] = blend_sources!(
+    GRADIENT_SLOTS,
+    source!("pixels", "pixels_2"),
+    source!("tile_queue"),
+    source!("sums", "sums_memory")
+);
+const BLEND_STRIPS: &[Source] = blend_sources!(
+    GRADIENT_SLOTS,
+    source!("pixels", "pixels_4"),
+    source!("strips"),
+    source!("lane_sums", "lane_sums_tree")
+);
+/// What `backward` imports where gradients meet unordered, in both forms.
+const BACKWARD_UNORDERED: &[Source] = blend_sources!(
+    source!("gradients", "gradients_meeting"),
+    source!("pixels", "pixels_2"),
+    source!("tile_queue"),
+    source!("sums", "sums_any")
+);
+const BACKWARD_STRIPS_UNORDERED: &[Source] = blend_sources!(
+    source!("gradients", "gradients_meeting"),
+    source!("pixels", "pixels_4"),
+    source!("strips"),
+    source!("lane_sums", "lane_sums_any")
+);
 
 macro_rules! kernel {
     ($name:literal) => {
@@ -127,8 +170,11 @@ pub const KERNELS: &[Kernel] = &[
     kernel!("backward", BLEND),
     kernel!("backward", BLEND_BY_MEMORY),
     kernel!("backward_strips", BLEND_STRIPS),
+    kernel!("backward", BACKWARD_UNORDERED),
+    kernel!("backward_strips", BACKWARD_STRIPS_UNORDERED),
     kernel!("update"),
     kernel!("update", WITH_CAMERA),
+    kernel!("update", UPDATE_UNORDERED),
     kernel!("correct_view"),
     kernel!("refine_camera"),
     kernel!("advance"),
@@ -228,6 +274,30 @@ impl LearnPipelines {
     #[cfg(test)]
     pub(crate) fn camera_gradients_only(gpu: &Gpu) -> Result<Pipeline, Error> {
         Pipeline::new(gpu, kernel!("refine_camera"), &[("GRADIENTS_ONLY", 1.0)])
+    }
+}
+
+/// The kernels of a step whose gradients meet by atomic additions and `subgroupAdd`, in any order. Learning never uses
+/// them: they tell what the written order costs.
+#[derive(Debug)]
+pub(crate) struct UnorderedPipelines {
+    pub(crate) backward: Pipeline,
+    pub(crate) update: Pipeline,
+}
+
+impl UnorderedPipelines {
+    /// `None` where the adapter offers no atomic additions of floats, no subgroups, or they were not asked for.
+    pub(crate) fn new(gpu: &Gpu, overrides_of_update: &[(&str, f64)]) -> Result<Option<Self>, Error> {
+        let backward = match gpu.optional().subgroup_lanes {
+            _ if !gpu.optional().float_atomics => return Ok(None),
+            Some(8) => Pipeline::new(gpu, kernel!("backward_strips", BACKWARD_STRIPS_UNORDERED), &[])?,
+            Some(lanes) if (16..=128).contains(&lanes) => {
+                Pipeline::new(gpu, kernel!("backward", BACKWARD_UNORDERED), &[("SUBGROUP", f64::from(lanes))])?
+            }
+            _ => return Ok(None),
+        };
+        let update = Pipeline::new(gpu, kernel!("update", UPDATE_UNORDERED), overrides_of_update)?;
+        Ok(Some(Self { backward, update }))
     }
 }
 

@@ -109,6 +109,23 @@ pub(super) fn train(trainer: &mut SplatTrainer, n_steps: u64) {
     }
 }
 
+/// Trains step by step, each in a submit of its own.
+fn train_one_by_one(trainer: &mut SplatTrainer, n_steps: u64) {
+    let end = trainer.progress().step + n_steps;
+    while trainer.progress().step < end {
+        trainer.step(1).unwrap();
+    }
+}
+
+/// Trains in submits of up to 40 steps, and one is always on its way.
+fn train_in_long_submits(trainer: &mut SplatTrainer, n_steps: u64) {
+    let end = trainer.progress().step + n_steps;
+    while trainer.progress().step < end {
+        trainer.assume_step_millis(0.5);
+        trainer.step(end - trainer.progress().step).unwrap();
+    }
+}
+
 pub(super) fn test_psnr(trainer: &mut SplatTrainer, keyframes: &[Arc<Keyframe>]) -> f64 {
     let tests: Vec<f64> = keyframes
         .iter()
@@ -316,4 +333,59 @@ fn a_keyframe_full_of_nan_costs_no_parameter() {
     }
     train(&mut trainer, 60);
     assert!(trainer.arrays().unwrap().checked().is_ok());
+}
+
+/// How many steps fit into a submit is measured, so it must not matter; also where cameras are learned.
+#[test]
+fn the_length_of_submits_changes_no_bit() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = keyframes(&gpu, true);
+    let mount = TermSet { mount: true, delay: true, ..TermSet::default() };
+    let learned = |train: fn(&mut SplatTrainer, u64)| {
+        let options = SplatOptions { cameras: CameraChoice::Given(mount), ..options() };
+        let mut trainer = SplatTrainer::new(gpu.clone(), options).unwrap();
+        for keyframe in &keyframes {
+            trainer.push(keyframe.clone()).unwrap();
+        }
+        train(&mut trainer, 130);
+        (trainer.arrays().unwrap(), trainer.camera_fixes().unwrap())
+    };
+    assert!(learned(train_in_long_submits) == learned(train_one_by_one));
+}
+
+/// Nor where a trial ends, and held-back images join in.
+#[test]
+fn the_length_of_submits_changes_no_bit_of_a_trial() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = n_keyframes(&gpu, 36, true);
+    let learned = |train: fn(&mut SplatTrainer, u64)| {
+        let mut trainer = trying_a_lens(&keyframes, gpu.clone(), 300);
+        train(&mut trainer, 790);
+        assert_eq!((trainer.trials().len(), trainer.n_taken().unwrap()), (1, 790 + 250));
+        (trainer.arrays().unwrap(), trainer.camera_fixes().unwrap())
+    };
+    assert!(learned(train_in_long_submits) == learned(train_one_by_one));
+}
+
+/// A submit whose intersections found no room is done again, and the one sent behind it is not counted twice.
+#[test]
+fn a_buffer_that_was_too_small_changes_no_bit() {
+    const N_STEPS: u64 = 90;
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = keyframes(&gpu, false);
+    let mut cloud = synthetic_cloud(4000, 5);
+    cloud.log_scales.fill([1.5; 3]); // Each covers every image: more intersections at full size than there is room for.
+    let learned = |train: fn(&mut SplatTrainer, u64)| {
+        let mut trainer = SplatTrainer::from_arrays(gpu.clone(), options(), &cloud).unwrap();
+        for keyframe in &keyframes {
+            trainer.push(keyframe.clone()).unwrap();
+        }
+        train(&mut trainer, N_STEPS);
+        // Rates and noise go by the GPU's own count.
+        (trainer.n_taken().unwrap(), trainer.n_steps_on_gpu(), trainer.arrays().unwrap())
+    };
+    let (one_by_one, together) = (learned(train_one_by_one), learned(train_in_long_submits));
+    assert_eq!((one_by_one.0, one_by_one.1), (N_STEPS, N_STEPS));
+    assert_eq!((together.0, together.1), (N_STEPS, N_STEPS));
+    assert!(one_by_one.2 == together.2);
 }

@@ -1,7 +1,7 @@
 //! The stages of drawing and learning, as lists of passes.
 
 use super::buffers::{BLOCK, Frame, GROUP, Scratch, SplatBuffers, WINDOW_BINS, n_bins, n_tiles};
-use super::kernels::{DrawPipelines, LearnPipelines};
+use super::kernels::{DrawPipelines, LearnPipelines, UnorderedPipelines};
 use super::params::Growth;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 
@@ -228,10 +228,14 @@ impl ViewPasses<'_> {
 
     /// Carries the slopes from the pixels to the intersections.
     pub(crate) fn backward(&self, passes: &mut Passes, pipelines: &LearnPipelines) {
+        self.backward_into(passes, &pipelines.backward, &self.scratch.gradients);
+    }
+
+    fn backward_into(&self, passes: &mut Passes, backward: &Pipeline, gradients: &Buffer) {
         let Self { gpu, scratch, frame, status, view, size_px, .. } = *self;
         passes.dispatch(
             gpu,
-            &pipelines.backward,
+            backward,
             u64::from(n_tiles(size_px)),
             &[
                 ("view", view),
@@ -243,7 +247,7 @@ impl ViewPasses<'_> {
                 ("upstream", &frame.upstream),
                 ("rest", &frame.rest),
                 ("last", &frame.last),
-                ("gradients", &scratch.gradients),
+                ("gradients", gradients),
             ],
         );
     }
@@ -265,23 +269,45 @@ impl ViewPasses<'_> {
     /// Carries the slopes from the intersections to the parameters and takes the optimiser's step; with `camera`, the
     /// kernel that also sums the slopes towards the camera.
     pub(crate) fn update(&self, passes: &mut Passes, update: &Pipeline, rule: &Buffer, camera: bool) {
+        let mut buffers = vec![("slot_begins", &self.scratch.slot_begins), ("gradients", &self.scratch.gradients)];
+        if camera {
+            buffers.push(("camera_sums", &self.scratch.camera_sums));
+        }
+        self.update_from(passes, update, rule, buffers);
+    }
+
+    /// `backward` and `update` by way of sums of a splat each, 12 f32, in which gradients meet in any order. They must be
+    /// zeros before, and are zeros after.
+    pub(crate) fn backward_and_update_unordered(
+        &self,
+        passes: &mut Passes,
+        pipelines: &UnorderedPipelines,
+        rule: &Buffer,
+        sums: &Buffer,
+    ) {
+        self.backward_into(passes, &pipelines.backward, sums);
+        self.update_from(passes, &pipelines.update, rule, vec![("gradients", sums)]);
+    }
+
+    fn update_from<'b>(
+        &'b self,
+        passes: &mut Passes,
+        update: &Pipeline,
+        rule: &'b Buffer,
+        mut buffers: Vec<(&'b str, &'b Buffer)>,
+    ) {
         let Self { gpu, splats, scratch, status, view, .. } = *self;
-        let mut buffers = vec![
+        buffers.extend([
             ("view", view),
             ("model", &splats.model),
             ("rule", rule),
             ("tile_counts", &scratch.tile_counts),
-            ("slot_begins", &scratch.slot_begins),
-            ("gradients", &scratch.gradients),
             ("status", status),
             ("error_sums", &splats.error_sums),
             ("drawn", &scratch.drawn),
-        ];
+        ]);
         buffers.extend(splats.parameters());
         buffers.extend(splats.all_moments());
-        if camera {
-            buffers.push(("camera_sums", &scratch.camera_sums));
-        }
         passes.dispatch(gpu, update, u64::from(splats.n_splats.div_ceil(BLOCK)), &buffers);
     }
 }

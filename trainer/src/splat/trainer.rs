@@ -88,6 +88,8 @@ pub struct SplatTrainer {
     scene_size_m: f64,
     has_depth: bool,
     step: u64,
+    /// Steps of trials that were taken back.
+    n_taken_back: u64,
     /// Step from which the planned steps count: late keyframes set it forward.
     schedule_start: u64,
     grown_at: u64,
@@ -198,6 +200,7 @@ impl SplatTrainer {
             scene_size_m: 1.0,
             has_depth: false,
             step: 0,
+            n_taken_back: 0,
             schedule_start: 0,
             grown_at: 0,
             n_poisoned: 0,
@@ -251,6 +254,16 @@ impl SplatTrainer {
         let (set, terms) = (self.cameras.set, &self.cameras.terms);
         let fixes = if set.any() { self.cameras.fixes(&self.gpu, set, terms)? } else { BTreeMap::new() };
         Ok(fixed(&fixes, keyframe))
+    }
+
+    #[cfg(test)]
+    pub(super) fn assume_step_millis(&mut self, millis: f64) {
+        self.step_millis = millis;
+    }
+
+    #[cfg(test)]
+    pub(super) fn n_steps_on_gpu(&self) -> u64 {
+        self.gpu.read::<u32>(&self.learn_status, status::LEN).unwrap()[status::STEP].into()
     }
 
     /// Gradients that were not finite and were dropped.
@@ -363,8 +376,9 @@ impl SplatTrainer {
 
     fn write_rule(&self) {
         if self.cameras.set.any() {
-            let done =
-                self.step.saturating_sub(self.schedule_start) as f64 / self.options.n_planned_steps.max(1) as f64;
+            // Where a submit begins depends on the clock, so what is told to it once must not depend on its first step.
+            let step = self.step - self.step % GROWTH_PERIOD;
+            let done = step.saturating_sub(self.schedule_start) as f64 / self.options.n_planned_steps.max(1) as f64;
             self.cameras.write_rule(&self.gpu, done, self.scene_size_m);
         }
         let size = f32_of(self.scene_size_m);
@@ -513,9 +527,9 @@ impl SplatTrainer {
         Ok(true)
     }
 
-    /// Waits for the submit in flight and takes note of what it did.
-    fn settle(&mut self) -> Result<(), Error> {
-        let Some(in_flight) = self.in_flight.take() else { return Ok(()) };
+    /// Waits for the submit in flight and takes note of what it did; says whether a buffer was too small for it.
+    fn settle(&mut self) -> Result<bool, Error> {
+        let Some(in_flight) = self.in_flight.take() else { return Ok(false) };
         let counters: Vec<u32> = in_flight.status.finish(&self.gpu)?;
         let done = Instant::now();
         let began = in_flight.since.max(self.idle_since); // The submit before was still running when this one was sent.
@@ -523,11 +537,12 @@ impl SplatTrainer {
         let millis = (done - began).as_secs_f64() * 1e3 / in_flight.n_steps.max(1) as f64;
         self.step_millis = if self.step_millis == 0.0 { millis } else { 0.8 * self.step_millis + 0.2 * millis };
         self.n_poisoned = u64::from(counters[status::N_POISONED]);
-        if self.mend(&counters)? {
+        let failed = self.mend(&counters)?;
+        if failed {
             self.step = u64::from(counters[status::STEP]);
             self.gpu.write(&self.learn_status, 4 * status::FAILED as u64, &[0; 12]);
         }
-        Ok(())
+        Ok(failed)
     }
 
     /// Step from which there are no more splats.
@@ -591,6 +606,7 @@ impl SplatTrainer {
 
     fn go_back(&mut self, state: State) -> Result<(), Error> {
         self.passes.forget_bindings();
+        self.n_taken_back = self.n_taken_back.wrapping_add(self.step).wrapping_sub(state.step);
         (self.splats, self.step, self.grown_at) = (state.splats, state.step, state.grown_at);
         self.cameras.go_back(&self.gpu, state.cameras)?;
         self.tell_n();
@@ -699,6 +715,7 @@ impl SplatTrainer {
 
 impl Method for SplatTrainer {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
+        self.settle()?; // The step at which it comes must be true.
         if keyframe.split == Split::Test {
             return Ok(());
         }
@@ -706,7 +723,6 @@ impl Method for SplatTrainer {
             self.trials.held_back.push(HeldBack { keyframe, image: None });
             return Ok(());
         }
-        self.settle()?;
         self.has_depth |= keyframe.depth.is_some();
         // What comes late finds at least half of the plan ahead of it: rates that still move things, and growth.
         self.schedule_start = self.schedule_start.max(self.step.saturating_sub(self.options.n_planned_steps / 2));
@@ -716,6 +732,7 @@ impl Method for SplatTrainer {
     }
 
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
+        self.settle()?; // The step at which it goes must be true.
         self.views.retain(|view| view.keyframe.camera.as_ref() != camera || view.keyframe.stamp != stamp);
         self.trials.remove(|keyframe| keyframe.camera.as_ref() == camera && keyframe.stamp == stamp);
         self.passes.forget_bindings();
@@ -747,12 +764,23 @@ impl Method for SplatTrainer {
         self.passes.submit(&self.gpu);
         let status = self.gpu.begin_read(&self.learn_status, status::LEN);
         self.step += n;
-        self.settle()?; // The submit before; this one runs meanwhile.
-        self.in_flight = Some(InFlight { status, n_steps: n, since });
+        let failed = self.settle()?; // The submit before; this one runs meanwhile.
+        if !failed {
+            self.in_flight = Some(InFlight { status, n_steps: n, since });
+        } // Else this one found the failure too and did nothing: its steps are to be done, not to be waited for.
         if n == asked {
             self.settle()?; // The caller stops here: the count must be true.
         }
         Ok(n)
+    }
+
+    fn n_taken(&mut self) -> Result<u64, Error> {
+        self.settle()?;
+        Ok(self.step.wrapping_add(self.n_taken_back))
+    }
+
+    fn seed(&mut self) -> Result<(), Error> {
+        self.seed_from_depth()
     }
 
     fn prepare(&mut self) -> Result<(), Error> {

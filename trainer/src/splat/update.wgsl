@@ -18,6 +18,7 @@
 #import sh
 #import status
 #import gradient
+#import gradient_sum
 #import random
 
 struct Rule {
@@ -45,8 +46,6 @@ struct Rule {
 @group(0) @binding(1) var<uniform> model: Model;
 @group(0) @binding(2) var<uniform> rule: Rule;
 @group(0) @binding(3) var<storage, read> tile_counts: array<u32>;
-@group(0) @binding(4) var<storage, read> slot_begins: array<u32>;
-@group(0) @binding(5) var<storage, read> gradients: array<Gradient>;
 @group(0) @binding(6) var<storage, read_write> means: array<vec4f>;
 @group(0) @binding(7) var<storage, read_write> rotations: array<vec4f>;
 @group(0) @binding(8) var<storage, read_write> shapes: array<vec4f>;
@@ -123,15 +122,7 @@ fn learn(splat_ix: u32) -> CameraGradient {
     let n_touched = tile_counts[splat_ix];
     if n_touched == 0u && rule.update_all == 0u && !GRADIENTS_ONLY { return camera; }
 
-    var sum: Gradient;
-    let begin = slot_begins[splat_ix];
-    for (var slot = begin; slot < begin + n_touched; slot++) {
-        let part = gradients[slot];
-        sum.place += part.place;
-        sum.conic += part.conic;
-        sum.color += part.color;
-    }
-
+    let sum = gradient_of(splat_ix, n_touched);
     let mean = means[splat_ix].xyz;
     let rotation = rotations[splat_ix];
     let shape = shapes[splat_ix];

@@ -1,0 +1,479 @@
+//! The log of what a clock decided: which keyframes came and went at which step, and when training ended.
+//!
+//! One JSON object a line, see `docs/saving.md`. There is no time in it: with the same data it gives the same model again.
+
+use crate::exit::BadArgument;
+use crate::fingerprint;
+use crate::join::{split_name, split_named};
+use anyhow::{Context, anyhow};
+use kinematics::Stamp;
+use serde::{Deserialize, Serialize};
+use std::fs::File;
+use std::io::Write;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::mpsc::{SyncSender, sync_channel};
+use std::thread::JoinHandle;
+use trainer::splat::SplatOptions;
+use trainer::{Keyframe, Split};
+
+const VERSION: u64 = 1;
+/// Name of the log in the folder of a run.
+const FILE: &str = "decisions.jsonl";
+/// Decisions that may wait for the disk; when so many do, training waits too.
+const MAX_WAITING: usize = 4096;
+
+/// The first line: the settings.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Settings {
+    version: u64,
+    pub(crate) method: String,
+    /// Name of the dataset folder or recording; none where a run was not recorded.
+    pub(crate) data: Option<String>,
+    /// What it ran on: another adapter rounds otherwise.
+    pub(crate) adapter: String,
+    /// Share of the width and height that images were shrunk to.
+    pub(crate) scale: f64,
+    /// Updates made before, where it went on from a checkpoint.
+    pub(crate) from_step: Option<u64>,
+    pub(crate) options: SplatOptions,
+}
+
+/// What settles a training beside its data.
+pub(crate) struct About<'a> {
+    pub(crate) method: &'a str,
+    pub(crate) data: Option<&'a Path>,
+    pub(crate) adapter: String,
+    pub(crate) scale: f64,
+    pub(crate) from_step: Option<u64>,
+    pub(crate) options: SplatOptions,
+}
+
+impl Settings {
+    pub(crate) fn new(about: About<'_>) -> Self {
+        let name = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned());
+        Self {
+            version: VERSION,
+            method: about.method.to_owned(),
+            data: about.data.and_then(name),
+            adapter: about.adapter,
+            scale: about.scale,
+            from_step: about.from_step,
+            options: about.options,
+        }
+    }
+}
+
+/// One decision, once so many updates had been made.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Entry {
+    /// Updates made before, those included that a trial took back.
+    pub(crate) step: u64,
+    #[serde(flatten)]
+    pub(crate) decision: Decision,
+}
+
+/// What was decided.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Decision {
+    /// The checkpoint that this went on from had learned from it.
+    Had(Pushed),
+    /// A keyframe came.
+    Push(Pushed),
+    /// A keyframe went.
+    Remove(Removed),
+    /// Somebody looked, so that the keyframes so far were given their splats before the next one came.
+    Seed(True),
+    /// The keyframes so far were begun to be learned from before the next one came, though no update was made yet.
+    Begin(True),
+    /// A checkpoint was taken: as far as this it had come.
+    Checkpoint(True),
+    /// Training ended.
+    End(True),
+}
+
+/// A keyframe that came.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Pushed {
+    pub(crate) camera: String,
+    pub(crate) stamp_nanos: i64,
+    split: String,
+    fingerprint: String,
+}
+
+/// A keyframe that went.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Removed {
+    pub(crate) camera: String,
+    pub(crate) stamp_nanos: i64,
+}
+
+/// The JSON value `true`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(into = "bool", try_from = "bool")]
+pub(crate) struct True;
+
+impl From<True> for bool {
+    fn from(_: True) -> Self {
+        true
+    }
+}
+
+impl TryFrom<bool> for True {
+    type Error = &'static str;
+    fn try_from(value: bool) -> Result<Self, Self::Error> {
+        if value { Ok(Self) } else { Err("must be true") }
+    }
+}
+
+impl Pushed {
+    fn of(keyframe: &Keyframe) -> Self {
+        Self {
+            camera: keyframe.camera.to_string(),
+            stamp_nanos: keyframe.stamp.0,
+            split: split_name(keyframe.split).to_owned(),
+            fingerprint: fingerprint_of(keyframe),
+        }
+    }
+
+    /// What it was for; known from the moment the log is read.
+    pub(crate) fn split(&self) -> Option<Split> {
+        split_named(&self.split)
+    }
+
+    /// Whether a keyframe has the same pixels, depth, lens, pose and velocity.
+    pub(crate) fn is_like(&self, keyframe: &Keyframe) -> bool {
+        self.fingerprint == fingerprint_of(keyframe)
+    }
+}
+
+fn fingerprint_of(keyframe: &Keyframe) -> String {
+    format!("{:016x}", fingerprint::of(keyframe))
+}
+
+/// What training did since the last decision that was written, as far as it matters for the next one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Since {
+    Nothing,
+    Seeded,
+    Begun,
+}
+
+/// A log being written, on a thread of its own: neither a slow disk nor a large image holds training up.
+pub(crate) struct DecisionLog {
+    sender: SyncSender<Line>,
+    thread: JoinHandle<std::io::Result<()>>,
+    last_step: Option<u64>,
+    since: Since,
+}
+
+enum Line {
+    Settings(Box<Settings>),
+    /// Its fingerprint takes a while.
+    Push(u64, Arc<Keyframe>),
+    Had(u64, Arc<Keyframe>),
+    Entry(Entry),
+}
+
+impl DecisionLog {
+    /// Begins a log in the folder of a run; one that goes on from a checkpoint leaves the log up to there alone.
+    pub(crate) fn create(folder: &Path, settings: Settings) -> anyhow::Result<Self> {
+        let name = match settings.from_step {
+            None => FILE.to_owned(),
+            Some(step) => FILE.replace('.', &format!("-from-{step}.")),
+        };
+        let path = folder.join(name);
+        let mut file = File::create(&path).with_context(|| format!("cannot write {}", path.display()))?;
+        let (sender, lines) = sync_channel(MAX_WAITING);
+        let thread = std::thread::Builder::new().name("decisions".into()).spawn(move || {
+            // Line by line: what was decided is on the disk when the process is killed.
+            lines.into_iter().try_for_each(|line: Line| file.write_all(line.text()?.as_bytes()))
+        });
+        let thread = thread.context("cannot start a thread")?;
+        let mut log = Self { sender, thread, last_step: None, since: Since::Nothing };
+        log.write(Line::Settings(Box::new(settings)));
+        Ok(log)
+    }
+
+    pub(crate) fn had(&mut self, step: u64, keyframe: &Arc<Keyframe>) {
+        self.write(Line::Had(step, keyframe.clone()));
+    }
+
+    pub(crate) fn pushed(&mut self, step: u64, keyframe: &Arc<Keyframe>) {
+        self.come_to(step);
+        self.write(Line::Push(step, keyframe.clone()));
+    }
+
+    pub(crate) fn removed(&mut self, step: u64, camera: &str, stamp: Stamp) {
+        self.come_to(step);
+        let gone = Removed { camera: camera.to_owned(), stamp_nanos: stamp.0 };
+        self.write(Line::Entry(Entry { step, decision: Decision::Remove(gone) }));
+    }
+
+    /// Somebody looked at the model.
+    pub(crate) fn seeded(&mut self) {
+        if self.since == Since::Nothing {
+            self.since = Since::Seeded;
+        }
+    }
+
+    /// Training was asked for steps.
+    pub(crate) fn begun(&mut self) {
+        self.since = Since::Begun;
+    }
+
+    pub(crate) fn checkpoint(&mut self, step: u64) {
+        self.come_to(step);
+        self.write(Line::Entry(Entry { step, decision: Decision::Checkpoint(True) }));
+    }
+
+    /// Ends the log; an error says why it is not whole.
+    pub(crate) fn end(mut self, step: u64) -> anyhow::Result<()> {
+        self.come_to(step);
+        self.write(Line::Entry(Entry { step, decision: Decision::End(True) }));
+        drop(self.sender);
+        let written = self.thread.join().map_err(|_| anyhow!("the thread of the log panicked: this is a bug"))?;
+        written.context("the log of decisions is not whole")
+    }
+
+    /// Writes down what happened between two decisions where no update tells it.
+    fn come_to(&mut self, step: u64) {
+        let between = match std::mem::replace(&mut self.since, Since::Nothing) {
+            Since::Seeded => Some(Decision::Seed(True)),
+            Since::Begun => Some(Decision::Begin(True)),
+            Since::Nothing => None,
+        };
+        if let Some(decision) = between
+            && self.last_step == Some(step)
+        {
+            self.write(Line::Entry(Entry { step, decision }));
+        }
+        self.last_step = Some(step);
+    }
+
+    fn write(&mut self, line: Line) {
+        // A thread that hung up tells why when it is joined.
+        let _ = self.sender.send(line);
+    }
+}
+
+impl Line {
+    fn text(self) -> std::io::Result<String> {
+        let mut text = match self {
+            Self::Settings(settings) => serde_json::to_string(&settings),
+            Self::Push(step, keyframe) => {
+                serde_json::to_string(&Entry { step, decision: Decision::Push(Pushed::of(&keyframe)) })
+            }
+            Self::Had(step, keyframe) => {
+                serde_json::to_string(&Entry { step, decision: Decision::Had(Pushed::of(&keyframe)) })
+            }
+            Self::Entry(entry) => serde_json::to_string(&entry),
+        }?;
+        text.push('\n');
+        Ok(text)
+    }
+}
+
+/// A log that was read.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Decisions {
+    pub(crate) settings: Settings,
+    pub(crate) entries: Vec<Entry>,
+}
+
+impl Decisions {
+    pub(crate) fn load(path: &Path) -> anyhow::Result<Self> {
+        let text =
+            std::fs::read_to_string(path).with_context(|| format!("cannot read the log of decisions {path:?}"))?;
+        Self::parse(&text).with_context(|| format!("the log of decisions {path:?}"))
+    }
+
+    /// Whether it tells how training ended; a run that was killed wrote no end.
+    pub(crate) fn is_whole(&self) -> bool {
+        self.entries.last().is_some_and(|entry| entry.decision == Decision::End(True))
+    }
+
+    /// The keyframes it names, in order.
+    pub(crate) fn pushed(&self) -> impl Iterator<Item = &Pushed> {
+        self.entries.iter().filter_map(|entry| match &entry.decision {
+            Decision::Had(pushed) | Decision::Push(pushed) => Some(pushed),
+            _ => None,
+        })
+    }
+
+    fn parse(text: &str) -> anyhow::Result<Self> {
+        let wrong = |reason: String| anyhow::Error::new(BadArgument(reason));
+        let mut lines = text.split_inclusive('\n').zip(1..);
+        let first = lines.next().map_or("", |(line, _)| line);
+        let about: serde_json::Value = serde_json::from_str(first).map_err(|e| wrong(format!("line 1: {e}")))?;
+        match about["version"].as_u64() {
+            Some(VERSION) => {}
+            Some(other) => return Err(wrong(format!("it is of version {other}, this program reads {VERSION}"))),
+            None => return Err(wrong("line 1 tells no version".to_owned())),
+        }
+        let settings = serde_json::from_value(about).map_err(|e| wrong(format!("line 1: {e}")))?;
+        let mut entries: Vec<Entry> = Vec::new();
+        for (line, number) in lines {
+            if !line.ends_with('\n') {
+                break; // A line that was being written when the run was killed.
+            }
+            let entry: Entry = serde_json::from_str(line).map_err(|e| wrong(format!("line {number}: {e}")))?;
+            let before = entries.last();
+            if before.is_some_and(|before| before.decision == Decision::End(True)) {
+                return Err(wrong(format!("line {number} comes after the end")));
+            }
+            if before.is_some_and(|before| before.step > entry.step) {
+                return Err(wrong(format!("line {number}: step {} comes after a later one", entry.step)));
+            }
+            if let Decision::Had(pushed) | Decision::Push(pushed) = &entry.decision
+                && pushed.split().is_none()
+            {
+                return Err(wrong(format!("line {number}: {:?} is not train, selection or test", pushed.split)));
+            }
+            entries.push(entry);
+        }
+        Ok(Self { settings, entries })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use kinematics::Transform;
+
+    fn settings(from_step: Option<u64>) -> Settings {
+        Settings::new(About {
+            method: "splat",
+            data: Some(Path::new("somewhere/scan.mcap")),
+            adapter: "llvmpipe".to_owned(),
+            scale: 0.5,
+            from_step,
+            options: SplatOptions { seed: 7, max_bytes: Some(5_000_000), ..SplatOptions::default() },
+        })
+    }
+
+    fn keyframe(stamp: i64, split: Split) -> Arc<Keyframe> {
+        Arc::new(Keyframe {
+            camera: "wrist".into(),
+            stamp: Stamp(stamp),
+            size_px: [1, 1],
+            focal_px: [1.0; 2],
+            principal_px: [0.5; 2],
+            rgba_srgb: vec![1, 2, 3, 255].into(),
+            depth: None,
+            world_from_camera: Transform::identity(),
+            twist: None,
+            readout_secs: 0.0,
+            split,
+            truth: None,
+        })
+    }
+
+    /// Two keyframes with a look between them, one that goes, and the end.
+    fn written(folder: &Path) -> String {
+        let mut log = DecisionLog::create(folder, settings(None)).expect("a log");
+        log.seeded(); // Before there is anything to see.
+        log.pushed(0, &keyframe(17, Split::Test));
+        log.seeded();
+        log.pushed(0, &keyframe(18, Split::Train));
+        log.begun();
+        log.pushed(0, &keyframe(19, Split::Selection));
+        log.begun();
+        log.seeded();
+        log.removed(40, "wrist", Stamp(17));
+        log.checkpoint(40);
+        log.begun();
+        log.end(60).expect("room on the disk");
+        std::fs::read_to_string(folder.join(FILE)).expect("the log")
+    }
+
+    #[test]
+    fn what_is_written_is_read_and_nothing_of_it_is_a_time_or_a_path() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let text = written(folder.path());
+        let read = Decisions::load(&folder.path().join(FILE)).expect("a log");
+        assert_eq!(read.settings, settings(None));
+        let told: Vec<(u64, String)> = text
+            .lines()
+            .skip(1)
+            .zip(&read.entries)
+            .map(|(line, entry)| {
+                assert_eq!(serde_json::to_string(entry).expect("JSON"), line);
+                let value: serde_json::Value = serde_json::from_str(line).expect("JSON");
+                let mut keys = value.as_object().expect("an object").keys().filter(|key| *key != "step");
+                (entry.step, keys.next().expect("a decision").clone())
+            })
+            .collect();
+        let expected = [
+            (0, "push"),
+            (0, "seed"),
+            (0, "push"),
+            (0, "begin"),
+            (0, "push"),
+            (40, "remove"),
+            (40, "checkpoint"),
+            (60, "end"),
+        ];
+        assert_eq!(told, expected.map(|(step, what)| (step, what.to_owned())));
+        assert!(read.is_whole());
+        let pushed: Vec<_> = read.pushed().map(|pushed| (pushed.stamp_nanos, pushed.split())).collect();
+        assert_eq!(pushed, [(17, Some(Split::Test)), (18, Some(Split::Train)), (19, Some(Split::Selection))]);
+        let first = read.pushed().next().expect("one");
+        assert!(first.is_like(&keyframe(17, Split::Train)), "a split is no part of the image");
+        let mut other = keyframe(17, Split::Test).as_ref().clone();
+        other.rgba_srgb = vec![1, 2, 4, 255].into();
+        assert!(!first.is_like(&other));
+        assert!(text.contains("\"data\":\"scan.mcap\"") && !text.contains("somewhere") && !text.contains("secs\":"));
+    }
+
+    #[test]
+    fn a_log_from_a_checkpoint_spares_the_one_before() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let before = written(folder.path());
+        let mut log = DecisionLog::create(folder.path(), settings(Some(130))).expect("a log");
+        log.had(130, &keyframe(18, Split::Train));
+        log.end(260).expect("room on the disk");
+        let read = Decisions::load(&folder.path().join("decisions-from-130.jsonl")).expect("a log");
+        assert_eq!((read.settings.from_step, read.pushed().count()), (Some(130), 1));
+        assert_eq!(std::fs::read_to_string(folder.path().join(FILE)).expect("the log"), before);
+    }
+
+    #[test]
+    fn a_log_that_was_cut_off_holds_what_was_whole() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let text = written(folder.path());
+        let lines = text.lines().count();
+        let cut = |n_bytes: usize| Decisions::parse(&text[..n_bytes]).expect("a log");
+        let ended = text.trim_end().rfind('\n').expect("lines") + 1;
+        for n_bytes in [ended, ended + 5, text.len() - 1] {
+            let read = cut(n_bytes);
+            assert!(!read.is_whole() && read.entries.len() == lines - 2, "{n_bytes}: {:?}", read.entries);
+        }
+        assert!(cut(text.find('\n').expect("a line") + 1).entries.is_empty());
+        assert!(Decisions::parse(&text[..9]).is_err(), "without settings there is nothing");
+    }
+
+    #[test]
+    fn what_makes_no_sense_is_named_with_its_line() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let text = written(folder.path());
+        for (was, is, told) in [
+            ("\"version\":1", "\"version\":9", "version 9, this program reads 1"),
+            ("\"version\"", "\"varsion\"", "line 1 tells no version"),
+            ("\"scale\"", "\"skale\"", "line 1: "),
+            ("\"begin\":true", "\"begin\":false", "line 5: must be true"),
+            ("\"seed\":true", "\"sing\":true", "line 3: "),
+            ("\"selection\"", "\"selected\"", "line 6: \"selected\" is not train"),
+            ("{\"step\":40,\"remove\"", "{\"step\":70,\"remove\"", "line 8: step 40 comes after a later one"),
+            ("{\"step\":40,\"checkpoint\":true}", "{\"step\":40,\"end\":true}", "line 9 comes after the end"),
+        ] {
+            assert!(text.contains(was), "{was}");
+            let error = format!("{:#}", Decisions::parse(&text.replace(was, is)).expect_err(is));
+            assert!(error.contains(told), "{error}");
+        }
+    }
+}

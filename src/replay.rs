@@ -1,0 +1,157 @@
+//! A training whose decisions are those of a log: `train --replay-decisions`.
+
+use crate::config::Override;
+use crate::data::Data;
+use crate::decisions::{Decision, Decisions};
+use crate::exit::{BadArgument, LackOfEvidence};
+use crate::join::KeyframeList;
+use crate::method::Kind;
+use crate::session::Session;
+use crate::stop::Stop;
+use kinematics::Stamp;
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+use trainer::Keyframe;
+
+/// A log of decisions, to be repeated.
+pub(crate) struct Replay {
+    path: PathBuf,
+    pub(crate) decisions: Decisions,
+    pub(crate) kind: Kind,
+}
+
+impl Replay {
+    /// Reads a log.
+    pub(crate) fn load(path: &Path) -> anyhow::Result<Self> {
+        let decisions = Decisions::load(path)?;
+        let kind = Kind::named(&decisions.settings.method).ok_or_else(|| {
+            BadArgument(format!("{}: there is no method {:?}", path.display(), decisions.settings.method))
+        })?;
+        let replay = Self { path: path.to_owned(), decisions, kind };
+        if replay.decisions.pushed().next().is_none() {
+            return Err(
+                LackOfEvidence(format!("{} names no keyframe: nothing is to be repeated", replay.name())).into()
+            );
+        }
+        Ok(replay)
+    }
+
+    /// Loads exactly the keyframes that the log names, and checks that they are the same.
+    pub(crate) fn load_data(&self, path: &Path, quiet: bool) -> anyhow::Result<Data> {
+        let pushed = || self.decisions.pushed();
+        let list: KeyframeList = pushed()
+            .filter_map(|pushed| Some((pushed.camera.clone(), Stamp(pushed.stamp_nanos), pushed.split()?)))
+            .collect();
+        let mut data = Data::of_list(path, list, self.decisions.settings.scale, &self.overrides(), quiet)?;
+        let there = by_name(&data.keyframes);
+        let (name, shown) = (self.name(), path.display());
+        for pushed in pushed() {
+            let (camera, stamp) = (&*pushed.camera, pushed.stamp_nanos);
+            let Some(keyframe) = there.get(&(camera, stamp)) else {
+                return Err(LackOfEvidence(format!(
+                    "{name} names image {stamp} of camera {camera:?}, which {shown} does not have"
+                ))
+                .into());
+            };
+            if !pushed.is_like(keyframe) {
+                return Err(LackOfEvidence(format!(
+                    "image {stamp} of camera {camera:?} has other pixels, depth, lens or pose in {shown} than {name} was written with"
+                ))
+                .into());
+            }
+        }
+        if !self.decisions.is_whole() {
+            let last = self.decisions.entries.last().map_or(0, |entry| entry.step);
+            data.losses.push(format!("{name} is cut off: its run is repeated up to step {last}, the last it tells of"));
+        }
+        Ok(data)
+    }
+
+    /// Refuses a model that is not where the log begins; `from_step`: updates made before, where it goes on from a checkpoint.
+    pub(crate) fn check_start(&self, from_step: Option<u64>) -> Result<(), BadArgument> {
+        let name = self.name();
+        match (self.decisions.settings.from_step, from_step) {
+            (log, here) if log == here => Ok(()),
+            (None, _) => Err(BadArgument(format!("{name} begins at the first step: leave out --resume"))),
+            (Some(log), None) => Err(BadArgument(format!(
+                "{name} is of a run that went on at step {log}: name the folder of that checkpoint with --resume"
+            ))),
+            (Some(log), Some(here)) => {
+                Err(BadArgument(format!("{name} goes on at step {log}, the checkpoint is of step {here}")))
+            }
+        }
+    }
+
+    /// Says where the bits may differ.
+    pub(crate) fn check_adapter(&self, adapter: &str) {
+        let then = &self.decisions.settings.adapter;
+        if then != adapter {
+            log::warn!("{} was written on {then:?}: another adapter rounds otherwise", self.name());
+        }
+    }
+
+    /// Repeats the decisions, each at its step.
+    pub(crate) fn drive(
+        &self,
+        mut session: Session,
+        keyframes: &[Arc<Keyframe>],
+        stop: &Stop,
+    ) -> anyhow::Result<Session> {
+        let there = by_name(keyframes);
+        session.start_clock(Instant::now());
+        for entry in &self.decisions.entries {
+            while !stop.asked() {
+                let n_taken = session.n_taken()?;
+                if n_taken >= entry.step {
+                    break;
+                }
+                if session.step(entry.step - n_taken)? == 0 {
+                    return Err(LackOfEvidence(format!(
+                        "{} asks for step {} where there is nothing to learn from",
+                        self.name(),
+                        entry.step
+                    ))
+                    .into());
+                }
+            }
+            if stop.asked() {
+                break;
+            }
+            match &entry.decision {
+                Decision::Push(pushed) => {
+                    if let Some(keyframe) = there.get(&(&*pushed.camera, pushed.stamp_nanos)) {
+                        session.push(keyframe)?;
+                    }
+                }
+                Decision::Remove(gone) => session.remove(&gone.camera, Stamp(gone.stamp_nanos))?,
+                Decision::Seed(_) => session.seed()?,
+                Decision::Begin(_) => drop(session.step(0)?),
+                Decision::Had(_) | Decision::Checkpoint(_) | Decision::End(_) => {}
+            }
+        }
+        Ok(session)
+    }
+
+    /// The settings as keys of a rig file, so that the settled one that is written tells the truth.
+    fn overrides(&self) -> Vec<Override> {
+        let options = &self.decisions.settings.options;
+        let mut overrides = vec![
+            Override::new("train.method", self.kind.name()),
+            Override::new("train.seed", options.seed.cast_signed()),
+            Override::new("train.max_splats", i64::from(options.max_splats)),
+            Override::new("train.sh_degree", i64::from(options.sh_degree)),
+        ];
+        overrides.extend(options.max_bytes.map(|bytes| Override::new("train.max_bytes", bytes.cast_signed())));
+        overrides
+    }
+
+    fn name(&self) -> String {
+        format!("the log {}", self.path.display())
+    }
+}
+
+fn by_name(keyframes: &[Arc<Keyframe>]) -> HashMap<(&str, i64), &Arc<Keyframe>> {
+    keyframes.iter().map(|keyframe| ((&*keyframe.camera, keyframe.stamp.0), keyframe)).collect()
+}

@@ -1,0 +1,14 @@
+// gradients: the intersections of a splat meet in its sum, in any order. Only to be measured: two steps differ by rounding.
+
+@group(0) @binding(9) var<storage, read_write> gradients: array<atomic<f32>>; // 12 a splat, see `Gradient`
+
+// Where the gradients of a tile's entry go.
+fn slot_of(entry: u32, tile: Tile) -> u32 {
+    return entries[entry].x;
+}
+
+fn tell(slot: u32, part: u32, value: f32) {
+    if value != 0.0 { atomicAdd(&gradients[slot * N_PARTS_OF_GRADIENT + part], value); }
+}
+
+fn tell_nothing(slot: u32, part: u32) {}

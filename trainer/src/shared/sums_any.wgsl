@@ -1,0 +1,23 @@
+// sums: adds up over the lanes of each subgroup in whatever order the hardware takes; the kernel is a function `backward`.
+// Only to be measured, with the `gradients` that meet.
+
+override SUBGROUP = 32u;
+
+@compute @workgroup_size(LANES)
+fn main(
+    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
+    @builtin(subgroup_id) subgroup: u32, @builtin(subgroup_invocation_id) sub_lane: u32,
+) {
+    backward(folded(wg, n_wgs), subgroup * SUBGROUP + sub_lane);
+}
+
+// Adds the sum of what every lane of the subgroup tells; 16 of them at least.
+fn hand_in(lane: u32, slot: u32, mine: Gradient) {
+    let place = subgroupAdd(mine.place);
+    let conic = subgroupAdd(mine.conic);
+    let color = subgroupAdd(mine.color);
+    let part = lane % min(SUBGROUP, LANES);
+    let four = select(select(place, conic, part >= 4u), color, part >= 8u);
+    let two = select(four.xy, four.zw, (part & 2u) != 0u);
+    if part < N_PARTS_OF_GRADIENT { tell(slot, part, select(two.x, two.y, (part & 1u) != 0u)); }
+}
