@@ -47,15 +47,19 @@ struct Disc {
 pub(crate) struct Density {
     /// At most.
     pub(crate) n_most: f64,
-    /// Pixels of one at least.
+    /// Pixels of one at least, where there are more than [`ALWAYS`].
     pub(crate) px_each: f64,
 }
+
+/// Discs that an image is given however few pixels it has.
+const ALWAYS: f64 = 4000.0;
 
 impl Density {
     /// Between two of them, whole pixels.
     fn stride_px(self, size_px: [u32; 2]) -> f64 {
         let n_pixels = f64::from(size_px[0]) * f64::from(size_px[1]);
-        (n_pixels / self.n_most).max(self.px_each).sqrt().round().max(1.0)
+        let n = self.n_most.min((n_pixels / self.px_each).max(ALWAYS));
+        (n_pixels / n).sqrt().round().max(1.0)
     }
 }
 
