@@ -5,6 +5,7 @@ use anyhow::Context;
 use drivers::BasePose;
 use kinematics::{Chain, HistoryError, Intrinsics, JointHistory, JointState, PoseHistory, Stamp, Transform, Twist};
 use nalgebra::Vector3;
+use std::sync::Arc;
 use std::time::Duration;
 
 /// Readings kept: 20 s at 1 kHz, more than any image waits.
@@ -26,10 +27,12 @@ enum BaseMotion {
 }
 
 /// A camera's pose and velocity at a stamp.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub(super) struct Posed {
     pub(super) world_from_camera: Transform,
     pub(super) twist: Option<Twist>,
+    /// Of the camera for each joint of the chain that moves by a radian or metre; none where no joint carries the camera.
+    pub(super) joint_twists: Arc<[Twist]>,
 }
 
 impl Motion {
@@ -79,7 +82,7 @@ impl Motion {
             BaseMotion::Told(history) if camera.parent != Parent::World => history.at(stamp)?,
             BaseMotion::Told(_) => Transform::identity(),
         };
-        let still = |world_from_camera| Posed { world_from_camera, twist: Some(Twist::zero()) };
+        let still = |world_from_camera| Posed { world_from_camera, twist: Some(Twist::zero()), joint_twists: [].into() };
         match camera.parent {
             Parent::World => Ok(still(camera.parent_from_camera)),
             Parent::Base => Ok(still(world_from_base * camera.parent_from_camera)),
@@ -90,9 +93,11 @@ impl Motion {
                     return Err(HistoryError::NotFinite);
                 };
                 let flange_twist = self.chain.tip_twist(&joints.position, &joints.velocity).ok();
+                let by_joint = self.chain.tip_twists_by_joint(&joints.position).unwrap_or_default();
                 Ok(Posed {
                     world_from_camera: world_from_base * base_from_flange * camera.parent_from_camera,
                     twist: flange_twist.map(|twist| twist.of_attached(&camera.parent_from_camera)),
+                    joint_twists: by_joint.iter().map(|twist| twist.of_attached(&camera.parent_from_camera)).collect(),
                 })
             }
         }
