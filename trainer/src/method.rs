@@ -1,5 +1,6 @@
 //! What every scene model can do.
 
+use crate::align::Alignment;
 use crate::checkpoint::PendingCheckpoint;
 use crate::splat::PosedLens;
 use crate::{Error, Keyframe, Picture, RenderRequest};
@@ -39,6 +40,8 @@ pub trait Method {
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error>;
     /// The camera of a keyframe as the model has it: with what was learned about all its images, not about this one.
     fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error>;
+    /// What alignment of the keyframes found, once that is settled; none where it was not asked for or could not be done.
+    fn alignment(&self) -> Option<&Alignment>;
     /// Where training stands.
     fn progress(&self) -> Progress;
     /// Writes the model into a folder.

@@ -11,6 +11,8 @@ use std::collections::BTreeMap;
 
 /// Differences beyond this are another surface's or a highlight, of 255.
 const CLIP: f64 = 50.0;
+/// Noise of an image, of 255: what lies below it does not show in pictures. The blurred images that are compared have less.
+const IMAGE_NOISE: f64 = 2.0;
 const HIDDEN_FRAC: f64 = 0.04;
 /// Fewer spots make no score.
 const LEAST_SPOTS: usize = 30;
@@ -42,6 +44,8 @@ pub(super) fn scores(
         let sums = by_image.entry(to).or_default();
         *sums = (sums.0 + n, sums.1 + without, sums.2 + with);
     }
-    let psnr = |n: usize, squares: f64| 10.0 * (255.0 * 255.0 * n as f64 / squares.max(1e-9)).log10();
+    let psnr = |n: usize, squares: f64| {
+        10.0 * (255.0 * 255.0 / (squares / n as f64 + IMAGE_NOISE * IMAGE_NOISE)).log10()
+    };
     by_image.into_values().map(|(n, without, with)| (psnr(n, without), psnr(n, with))).unzip()
 }

@@ -181,8 +181,6 @@ impl Scene {
         let noise = with.fit.as_ref().map_or(sums::Noise { photo: 5.0, depth: 0.005 }, |fit| fit.noise);
         let (without_db, with_db) =
             judge::scores(&self.frames, &self.judging, &without.corrections, &with.corrections, noise);
-        #[cfg(test)]
-        eprintln!("alignment: {terms}: without {without_db:.2?}, with {with_db:.2?} dB noise {noise:?}");
         log::debug!("alignment: {terms}: without {without_db:.2?}, with {with_db:.2?} dB");
         let mut trial = Trial::of(terms, &without_db, &with_db);
         trial.kept &= trial.n_images >= LEAST_JUDGES;

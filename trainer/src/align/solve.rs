@@ -23,7 +23,7 @@ pub(super) struct Solved {
     is_seen: Vec<bool>,
     /// In units of the terms.
     pub(super) step: DVector<f64>,
-    covariances: [DMatrix<f64>; 2],
+    covariance: DMatrix<f64>,
 }
 
 impl Solved {
@@ -60,39 +60,33 @@ impl Solved {
             step *= LONGEST_STEP / longest;
         }
         let mut solved =
-            Self { step: step.component_mul(&scales), scales, eigen, is_seen, covariances: [(); 2].map(|()| DMatrix::zeros(n, n)) };
-        solved.covariances = solved.covariances(pairs, sums);
+            Self { step: step.component_mul(&scales), scales, eigen, is_seen, covariance: DMatrix::zeros(n, n) };
+        solved.covariance = solved.covariance(pairs, sums);
         solved
     }
 
-    /// Covariance from the scatter of what the pairs say, in scaled units: pairs that share a frame err together, or none do.
+    /// Covariance from the scatter of what the pairs say, in scaled units: pairs that share a frame err together, and each on
+    /// its own; where only one of both is so it comes out too large by at most two.
     ///
     /// Source: White 1980 (the sandwich); Aronow, Samii and Assenova 2015 (pairs that share a member).
-    fn covariances(&self, pairs: &[Pair], sums: &[PairSums]) -> [DMatrix<f64>; 2] {
+    fn covariance(&self, pairs: &[Pair], sums: &[PairSums]) -> DMatrix<f64> {
         let n = self.scales.len();
         let n_frames = pairs.iter().map(|pair| pair.from.max(pair.to) + 1).max().unwrap_or(0);
         let mut by_frame = vec![DVector::<f64>::zeros(n); n_frames];
-        let mut by_pair = DMatrix::zeros(n, n);
-        let mut n_used = 0.0;
         for (pair, sums) in pairs.iter().zip(sums) {
-            let mut score = DVector::zeros(n);
             for (row, term) in sums.terms.iter().enumerate() {
-                score[*term] = self.scales[*term] * sums.gradient[row];
+                by_frame[pair.from][*term] += self.scales[*term] * sums.gradient[row];
+                by_frame[pair.to][*term] += self.scales[*term] * sums.gradient[row];
             }
-            by_frame[pair.from] += &score;
-            by_frame[pair.to] += &score;
-            by_pair.ger(1.0, &score, &score, 1.0);
-            n_used += 1.0;
         }
-        let mut by_sharing = -by_pair.clone();
+        let mut meat = DMatrix::zeros(n, n);
         let mut n_shown = 0.0f64;
         for score in by_frame.iter().filter(|score| score.norm_squared() > 0.0) {
-            by_sharing.ger(1.0, score, score, 1.0);
+            meat.ger(1.0, score, score, 1.0);
             n_shown += 1.0;
         }
         let inverse = self.inverse();
-        let few = |n: f64| n / (n - 1.0).max(1.0);
-        [(by_pair, few(n_used)), (by_sharing, few(n_shown))].map(|(meat, few)| &inverse * meat * &inverse * few)
+        &inverse * meat * &inverse * (n_shown / (n_shown - 1.0).max(1.0))
     }
 
     /// Inverse of the information over what is seen, in scaled units.
@@ -109,7 +103,7 @@ impl Solved {
     /// Variance of the sum of the terms, each times its weight.
     pub(super) fn variance(&self, weights: &DVector<f64>) -> f64 {
         let scaled = weights.component_mul(&self.scales);
-        self.covariances.iter().map(|covariance| (covariance * &scaled).dot(&scaled)).fold(0.0, f64::max)
+        (&self.covariance * &scaled).dot(&scaled).max(0.0)
     }
 
     /// Standard deviation of one term.

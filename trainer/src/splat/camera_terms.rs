@@ -8,7 +8,7 @@ use super::params::{CameraRule, Lens, N_TERMS};
 use super::passes::ViewPasses;
 use crate::checkpoint::Checkpoint;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline, f32_of, f32s_of};
-use crate::{DepthMap, Error, Keyframe};
+use crate::{DepthMap, Error, Keyframe, Shutter};
 use kinematics::{Stamp, Transform, Twist, transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::collections::BTreeMap;
@@ -126,6 +126,8 @@ pub struct PosedLens {
     pub focal_px: [f64; 2],
     /// Principal point, pixels.
     pub principal_px: [f64; 2],
+    /// How it moves while its rows are read, where known.
+    pub shutter: Option<Shutter>,
 }
 
 impl PosedLens {
@@ -135,6 +137,7 @@ impl PosedLens {
             world_from_camera: keyframe.world_from_camera,
             focal_px: keyframe.focal_px,
             principal_px: keyframe.principal_px,
+            shutter: keyframe.twist.map(|twist| Shutter { twist, readout_secs: keyframe.readout_secs }),
         }
     }
 }
@@ -169,8 +172,15 @@ impl CameraFix {
         let mount = moved(self.turn_rad.into(), self.shift_m.into());
         let [turn_x, turn_y, turn_z, x, y, z] = self.drift_at(keyframe.stamp);
         let drift = moved(Vector3::new(turn_x, turn_y, turn_z), Vector3::new(x, y, z));
+        let world_from_camera = (mount * drift * joints * delay * lens.world_from_camera.inverse()).inverse();
+        let raw_from_corrected = lens.world_from_camera.inverse() * world_from_camera;
+        let shutter = |shutter: Shutter| Shutter {
+            twist: shutter.twist.of_attached(&raw_from_corrected),
+            readout_secs: (shutter.readout_secs + self.readout_secs).max(0.0),
+        };
         PosedLens {
-            world_from_camera: (mount * drift * joints * delay * lens.world_from_camera.inverse()).inverse(),
+            world_from_camera,
+            shutter: lens.shutter.map(shutter),
             focal_px: std::array::from_fn(|axis| lens.focal_px[axis] * self.log_focal[axis].exp()),
             principal_px: std::array::from_fn(|axis| {
                 lens.principal_px[axis] + self.principal_focals[axis] * lens.focal_px[axis]
@@ -186,7 +196,7 @@ impl CameraFix {
 
     /// The keyframe as it would be had the input been right.
     pub fn corrected(&self, keyframe: &Keyframe) -> Keyframe {
-        let PosedLens { world_from_camera, focal_px, principal_px } = self.apply(keyframe);
+        let PosedLens { world_from_camera, focal_px, principal_px, .. } = self.apply(keyframe);
         let depth = keyframe.depth.as_ref().map(|depth| {
             let same_lens = shares_lens(keyframe, depth);
             let focal = |axis: usize| depth.focal_px[axis] * self.log_focal[axis].exp();
