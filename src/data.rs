@@ -2,7 +2,7 @@
 
 use crate::config::{Override, Rig};
 use crate::dataset;
-use crate::exit::LackOfEvidence;
+use crate::exit::{BadArgument, LackOfEvidence};
 use crate::holdout::Holdout;
 use crate::join::{Join, JoinEvent, KeyframeList, Use};
 use crate::open::{self, Opened};
@@ -24,6 +24,9 @@ pub(crate) struct DataArgs {
     /// Take exactly the keyframes of a list that an earlier run wrote (keyframes.txt)
     #[arg(long, value_name = "FILE", conflicts_with = "holdout")]
     pub(crate) keyframes: Option<PathBuf>,
+    /// Read a recording with this rig file instead of the one in it
+    #[arg(long, value_name = "FILE")]
+    pub(crate) rig: Option<PathBuf>,
     /// Shrink the images (not their depth) to this share of their width and height, 0.05 to 1 [default: the rig file's, else 1]
     #[arg(long, value_name = "SHARE", value_parser = shrink::share)]
     pub(crate) scale: Option<f64>,
@@ -65,7 +68,11 @@ impl Data {
         let holdout = args.holdout.as_deref().map(Holdout::from_argument).transpose()?;
         let is_recording = path.extension().is_some_and(|ending| ending == RECORDING_ENDING);
         let mut data = if is_recording {
-            Self::from_recording(path, list, overrides.iter().cloned().chain(args.overrides()).collect(), quiet)?
+            let overrides: Vec<Override> = overrides.iter().cloned().chain(args.overrides()).collect();
+            let rig = args.rig.as_deref().map(|file| Rig::load(file, &overrides)).transpose()?;
+            Self::from_recording(path, rig, list, overrides, quiet)?
+        } else if let Some(rig) = &args.rig {
+            return Err(BadArgument(format!("--rig {}: only recordings are read with one", rig.display())).into());
         } else {
             Self::from_folder(path, &holdout.clone().unwrap_or_default(), args.scale.unwrap_or(1.0), list, quiet)?
         };
@@ -118,11 +125,12 @@ impl Data {
 
     fn from_recording(
         path: &Path,
+        rig: Option<Rig>,
         list: Option<KeyframeList>,
         overrides: Vec<Override>,
         quiet: bool,
     ) -> anyhow::Result<Self> {
-        let Opened { rig, mut source, damage } = open::recording(path, None, &overrides)?;
+        let Opened { rig, mut source, damage } = open::recording(path, rig, &overrides)?;
         let mut join = Join::new(&rig)?;
         if let Some(list) = list {
             join = join.taking_only(list);

@@ -6,7 +6,7 @@ use crate::exit::BadArgument;
 use crate::method::{self, Kind};
 use crate::session::{Evaluators, Limits, Session, Tell};
 use crate::stop::Stop;
-use crate::training_args::{Refine, TrainingArgs};
+use crate::training_args::{Evidence, Refine, Refining, TrainingArgs};
 use std::sync::Arc;
 use std::time::Instant;
 use trainer::Keyframe;
@@ -51,9 +51,14 @@ pub(crate) fn model(
     software: bool,
 ) -> Result<(Kind, SplatOptions), BadArgument> {
     // A trial takes hundreds of steps more: on a processor that is minutes.
-    let cameras = args.cameras(data.rig.is_some(), if software { Refine::None } else { Refine::Auto })?;
+    let evidence = Evidence {
+        joints: data.rig.is_some(),
+        depth: data.keyframes.iter().any(|keyframe| keyframe.depth.is_some()),
+    };
+    let Refining { align, learn: cameras } =
+        args.refining(evidence, if software { Refine::None } else { Refine::Auto })?;
     if let Some(rig) = &data.rig {
-        return Ok((Kind::of_rig(rig)?, SplatOptions { cameras, ..method::options(&rig.train, steps)? }));
+        return Ok((Kind::of_rig(rig)?, SplatOptions { cameras, align, ..method::options(&rig.train, steps)? }));
     }
     let usual = SplatOptions::default();
     let options = SplatOptions {
@@ -61,6 +66,7 @@ pub(crate) fn model(
         max_splats: args.max_splats.map_or(usual.max_splats, |n| n.try_into().unwrap_or(u32::MAX)),
         max_bytes: args.max_bytes,
         cameras,
+        align,
         n_planned_steps: steps.unwrap_or(usual.n_planned_steps),
         ..usual
     };

@@ -1,9 +1,11 @@
 //! `fieldrig train`: a model of a dataset folder or a recording.
 
 use crate::checkpoints::{self, CheckpointArgs, Checkpoints};
+use crate::config::Rig;
+use crate::corrected_rig;
 use crate::data::{Data, DataArgs, Purpose};
 use crate::evaluate::Evaluator;
-use crate::exit::{self, Exit};
+use crate::exit::{self, BadArgument, Exit};
 use crate::method::{self, Resumed};
 use crate::print;
 use crate::run_folder;
@@ -15,6 +17,7 @@ use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use trainer::Split;
+use trainer::align::Alignment;
 
 /// Length of a training where no flag says.
 const USUAL_SECONDS: f64 = 120.0;
@@ -46,6 +49,9 @@ pub(crate) struct Args {
     /// Where the results go; a folder that holds a model is refused [default: the folder of --resume if it holds none, else a new one in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
+    /// Write the recording's rig file here with what was found about its cameras
+    #[arg(long, value_name = "FILE")]
+    write_rig: Option<PathBuf>,
     #[command(flatten)]
     checkpoints: CheckpointArgs,
     /// Print one JSON object a line
@@ -64,6 +70,8 @@ struct Particulars<'a> {
     n_selection: usize,
     n_test: usize,
     losses: &'a [String],
+    /// What was found about cameras by laying images over each other.
+    alignment: Option<Alignment>,
 }
 
 /// Loads, trains until a limit or Ctrl-C, scores at the marks, saves.
@@ -78,6 +86,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
     let evaluators = Evaluators { at_marks: evaluator.clone(), most_at_marks: usize::MAX, at_end: evaluator };
     let data = Data::load(&args.data, &args.images, Purpose::Training, &args.training.overrides(), args.json)?;
+    if args.write_rig.is_some() && data.rig.is_none() {
+        return Err(BadArgument(format!("--write-rig: {} holds no rig file; recordings do", args.data.display())).into());
+    }
     let gpu = super::open_gpu()?;
     let Resumed { kind, mut method, options, rest } = match &checkpoint {
         Some(checkpoint) => args.resumed(method::resume(gpu.clone(), checkpoint, &data.keyframes)?),
@@ -100,6 +111,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         .going_on_after(checkpoint.map_or(0.0, |checkpoint| checkpoint.seconds));
     let session = training::drive(session, &rest, &stop)?;
 
+    let alignment = session.method.alignment().cloned();
+    if let (Some(file), Some(rig)) = (&args.write_rig, &data.rig) {
+        write_rig(rig, alignment.as_ref(), file)?;
+    }
     let startup_secs = session.clock_started().map_or(0.0, |at| (at - started).as_secs_f64());
     session.finish(
         &out,
@@ -112,9 +127,23 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             n_selection: data.of_split(Split::Selection).len(),
             n_test: data.of_split(Split::Test).len(),
             losses: &data.losses,
+            alignment,
         },
     )?;
     Ok(exit::after(&data.losses))
+}
+
+/// Writes the rig file, and says where nothing changed in it.
+fn write_rig(rig: &Rig, alignment: Option<&Alignment>, file: &Path) -> anyhow::Result<()> {
+    match alignment {
+        None => log::warn!("images were not laid over each other: the rig file is written as it was"),
+        Some(alignment) if !alignment.is_any() => log::info!("the rig file needs no correction"),
+        Some(_) => {}
+    }
+    let rig = alignment.map_or_else(|| Ok(rig.clone()), |alignment| corrected_rig::corrected(rig, alignment))?;
+    corrected_rig::write(&rig, file)?;
+    log::info!("rig file written to {}", file.display());
+    Ok(())
 }
 
 impl Args {

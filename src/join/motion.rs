@@ -16,6 +16,8 @@ pub(super) struct Motion {
     chain: Chain,
     /// Where each joint of the chain stands in the readings.
     order: Vec<usize>,
+    /// What is added to each joint of the chain.
+    offsets: Vec<f64>,
     joints: JointHistory,
     base: BaseMotion,
 }
@@ -47,7 +49,8 @@ impl Motion {
                 BaseMotion::Told(PoseHistory::new(max_gap, MAX_READINGS))
             }
         };
-        Ok(Self { chain, order, joints: JointHistory::new(max_gap, MAX_READINGS), base })
+        let offsets = order.iter().map(|ix| rig.arm.joint_offsets.get(*ix).copied().unwrap_or(0.0)).collect();
+        Ok(Self { chain, order, offsets, joints: JointHistory::new(max_gap, MAX_READINGS), base })
     }
 
     /// Takes joint readings in the order of the device; says whether they made sense.
@@ -60,6 +63,7 @@ impl Motion {
         };
         let state = match (ordered(&state.position), ordered(&state.velocity)) {
             (Some(position), Some(velocity)) if !position.is_empty() => {
+                let position = position.iter().zip(&self.offsets).map(|(reading, offset)| reading + offset).collect();
                 JointState { stamp: state.stamp, position, velocity, effort: Vec::new() }
             }
             _ => return false,

@@ -78,7 +78,8 @@ impl SplatTrainer {
     }
 
     fn aligned_at(&self) -> u64 {
-        if self.gpu.is_software() { TAKEN_AT_ON_SOFTWARE } else { TAKEN_AT }
+        let usual = if self.gpu.is_software() { TAKEN_AT_ON_SOFTWARE } else { TAKEN_AT };
+        usual.min(self.options.n_planned_steps / 4).max(1)
     }
 
     /// Begins alignment, or takes its result.
