@@ -1,6 +1,7 @@
 //! The rig file with what alignment found: the rig calibrates itself.
 
 use crate::config::{Camera, Measured, Rig};
+use crate::exit::BadArgument;
 use anyhow::{Context, ensure};
 use kinematics::{Chain, Intrinsics, Transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
@@ -28,6 +29,15 @@ pub(crate) fn corrected(rig: &Rig, alignment: &Alignment) -> anyhow::Result<Rig>
         }
     }
     Ok(rig)
+}
+
+/// Refuses a place where no file can be written.
+pub(crate) fn refuse_place(file: &Path) -> Result<(), BadArgument> {
+    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    if folder.is_dir() && !file.is_dir() {
+        return Ok(());
+    }
+    Err(BadArgument(format!("--write-rig {}: must be a file in a folder that exists", file.display())))
 }
 
 /// Writes a rig file, and the robot's description beside it, where no other one lies.

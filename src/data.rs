@@ -90,6 +90,12 @@ impl Data {
         Ok(data)
     }
 
+    /// The rig file that a recording is read with, without what flags override; a folder has none.
+    pub(crate) fn rig_as_given(path: &Path, args: &DataArgs) -> anyhow::Result<Rig> {
+        let rig = args.rig.as_deref().map(|file| Rig::load(file, &[])).transpose()?;
+        Ok(open::recording(path, rig, &[])?.rig)
+    }
+
     /// Keyframes of one split.
     pub(crate) fn of_split(&self, split: Split) -> Vec<Arc<Keyframe>> {
         self.keyframes.iter().filter(|keyframe| keyframe.split == split).cloned().collect()

@@ -86,8 +86,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
     let evaluators = Evaluators { at_marks: evaluator.clone(), most_at_marks: usize::MAX, at_end: evaluator };
     let data = Data::load(&args.data, &args.images, Purpose::Training, &args.training.overrides(), args.json)?;
-    if args.write_rig.is_some() && data.rig.is_none() {
-        return Err(BadArgument(format!("--write-rig: {} holds no rig file; recordings do", args.data.display())).into());
+    if let Some(file) = &args.write_rig {
+        if data.rig.is_none() {
+            let data = args.data.display();
+            return Err(BadArgument(format!("--write-rig: {data} holds no rig file; recordings do")).into());
+        }
+        corrected_rig::refuse_place(file)?; // Not after all the training.
     }
     let gpu = super::open_gpu()?;
     let Resumed { kind, mut method, options, rest } = match &checkpoint {
@@ -112,8 +116,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let session = training::drive(session, &rest, &stop)?;
 
     let alignment = session.method.alignment().cloned();
-    if let (Some(file), Some(rig)) = (&args.write_rig, &data.rig) {
-        write_rig(rig, alignment.as_ref(), file)?;
+    if let Some(file) = &args.write_rig {
+        write_rig(&Data::rig_as_given(&args.data, &args.images)?, alignment.as_ref(), file)?;
     }
     let startup_secs = session.clock_started().map_or(0.0, |at| (at - started).as_secs_f64());
     session.finish(

@@ -8,11 +8,11 @@ use super::solve::Solved;
 use super::sums::{self, Looks, Noise};
 
 /// Steps at each level, the finest first.
-const ROUNDS: [usize; 4] = [5, 3, 3, 4];
+const ROUNDS: [usize; 4] = [12, 4, 4, 4];
 /// By how much of its depth a point may be off before it counts as hidden, the finest first: errors are large at first.
 const HIDDEN_FRAC: [f64; 4] = [0.04, 0.05, 0.07, 0.1];
-/// A step below this share of what a term may be ends a level.
-const SMALL_STEP: [f64; 4] = [2e-4, 5e-3, 1e-2, 2e-2];
+/// A step below this many standard deviations ends a level.
+const SMALL_STEP: [f64; 4] = [0.2, 2.0, 2.0, 2.0];
 const FIRST_NOISE: Noise = Noise { photo: 20.0, depth: 0.005 };
 
 /// What came of a fit.
@@ -41,7 +41,8 @@ pub(super) fn fit(frames: &[Frame], pairs: &[Pair], layout: Layout, from: &Corre
             how.noise = sums::noise_of(&sums)?;
             let solved = Solved::new(&layout, &corrections, &some, &sums);
             corrections.take(&layout, &solved.step);
-            let is_small = solved.step_in_scales() < SMALL_STEP[level];
+            log::debug!("alignment: level {level}, {:?}, step of {:.2} sigma", how.noise, solved.step_in_sigmas());
+            let is_small = solved.step_in_sigmas() < SMALL_STEP[level];
             last = Some(solved);
             if is_small {
                 break;

@@ -138,8 +138,9 @@ impl Solved {
         order.into_iter().map(direction).collect()
     }
 
-    /// The step in standard deviations, at most over the terms.
-    pub(super) fn step_in_scales(&self) -> f64 {
-        self.step.component_div(&self.scales).amax()
+    /// The step in standard deviations, the most over the terms.
+    pub(super) fn step_in_sigmas(&self) -> f64 {
+        let in_sigmas = |(ix, step): (usize, &f64)| step.abs() / self.sigma(ix).max(f64::MIN_POSITIVE);
+        self.step.iter().enumerate().filter(|(ix, _)| self.unseen_share(*ix) < 0.5).map(in_sigmas).fold(0.0, f64::max)
     }
 }
