@@ -224,7 +224,7 @@ fn blurred([width, height]: [usize; 2], sharp: &[f32]) -> Vec<f32> {
 }
 
 impl Grey {
-    fn new(size: [usize; 2], pixels: f64, sharp: &[f32]) -> Self {
+    pub(super) fn new(size: [usize; 2], pixels: f64, sharp: &[f32]) -> Self {
         let [width, height] = size;
         let values = blurred(size, sharp);
         let nothing = [f32::NAN; 3];

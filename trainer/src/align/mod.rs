@@ -19,7 +19,7 @@ mod residual;
 mod solve;
 mod sums;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod view;
 
 pub use report::{Alignment, Found, Unseen};

@@ -2,6 +2,8 @@
 
 #[cfg(test)]
 mod against_twin;
+#[cfg(test)]
+mod aligned;
 pub mod arrays;
 pub mod bench;
 mod buffers;
