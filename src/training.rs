@@ -51,10 +51,8 @@ pub(crate) fn model(
     software: bool,
 ) -> Result<(Kind, SplatOptions), BadArgument> {
     // A trial takes hundreds of steps more: on a processor that is minutes.
-    let evidence = Evidence {
-        joints: data.rig.is_some(),
-        depth: data.keyframes.iter().any(|keyframe| keyframe.depth.is_some()),
-    };
+    let evidence =
+        Evidence { joints: data.rig.is_some(), depth: data.keyframes.iter().any(|keyframe| keyframe.depth.is_some()) };
     let Refining { align, learn: cameras } =
         args.refining(evidence, if software { Refine::None } else { Refine::Auto })?;
     if let Some(rig) = &data.rig {

@@ -76,7 +76,8 @@ impl TrainingArgs {
         }
         let needs_depth = [Refine::Joints, Refine::DepthPose, Refine::DepthScale, Refine::Readout];
         if let (Some(term), false) = (needs_depth.into_iter().find(|term| has(*term)), evidence.depth) {
-            let name = clap::ValueEnum::to_possible_value(&term).map_or(String::new(), |name| name.get_name().to_owned());
+            let name =
+                clap::ValueEnum::to_possible_value(&term).map_or(String::new(), |name| name.get_name().to_owned());
             return Err(BadArgument(format!("--refine {name}: needs images with depth, and all of them at the start")));
         }
         if has(Refine::Joints) && !evidence.joints {

@@ -86,7 +86,8 @@ impl Motion {
             BaseMotion::Told(history) if camera.parent != Parent::World => history.at(stamp)?,
             BaseMotion::Told(_) => Transform::identity(),
         };
-        let still = |world_from_camera| Posed { world_from_camera, twist: Some(Twist::zero()), joint_twists: [].into() };
+        let still =
+            |world_from_camera| Posed { world_from_camera, twist: Some(Twist::zero()), joint_twists: [].into() };
         match camera.parent {
             Parent::World => Ok(still(camera.parent_from_camera)),
             Parent::Base => Ok(still(world_from_base * camera.parent_from_camera)),

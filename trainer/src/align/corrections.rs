@@ -33,7 +33,9 @@ impl Corrections {
             Term::Mount(camera, part) if part < 3 => -self.fixes[camera].shift_m[part],
             Term::Mount(camera, part) => -self.fixes[camera].turn_rad[part - 3],
             Term::Delay(camera) => self.fixes[camera].delay_secs,
-            Term::Joint(joint) => self.fixes.iter().find_map(|fix| fix.joint_offsets.get(joint)).copied().unwrap_or(0.0),
+            Term::Joint(joint) => {
+                self.fixes.iter().find_map(|fix| fix.joint_offsets.get(joint)).copied().unwrap_or(0.0)
+            }
             Term::DepthPose(camera, part) if part < 3 => self.fixes[camera].depth_shift_m[part],
             Term::DepthPose(camera, part) => self.fixes[camera].depth_turn_rad[part - 3],
             Term::Lens(camera, part) if part < 2 => self.fixes[camera].log_focal[part],

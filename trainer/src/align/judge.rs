@@ -44,8 +44,7 @@ pub(super) fn scores(
         let sums = by_image.entry(to).or_default();
         *sums = (sums.0 + n, sums.1 + without, sums.2 + with);
     }
-    let psnr = |n: usize, squares: f64| {
-        10.0 * (255.0 * 255.0 / (squares / n as f64 + IMAGE_NOISE * IMAGE_NOISE)).log10()
-    };
+    let psnr =
+        |n: usize, squares: f64| 10.0 * (255.0 * 255.0 / (squares / n as f64 + IMAGE_NOISE * IMAGE_NOISE)).log10();
     by_image.into_values().map(|(n, without, with)| (psnr(n, without), psnr(n, with))).unzip()
 }

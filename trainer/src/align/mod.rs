@@ -163,7 +163,8 @@ impl Scene {
             trials.push(trial);
         }
         for part in parts.clone().into_iter().rev().skip(1) {
-            let rest = parts.iter().filter(|other| **other != part).fold(TermSet::default(), |set, other| set.and(*other));
+            let rest =
+                parts.iter().filter(|other| **other != part).fold(TermSet::default(), |set, other| set.and(*other));
             let Some(without) = self.model(rest, &kept) else { continue };
             let (trial, _) = self.judge(part, &without, &kept);
             if !trial.kept {

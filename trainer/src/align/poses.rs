@@ -21,7 +21,12 @@ const LONGEST_STEP: f64 = 2.0;
 const FIRST_NOISE: Noise = Noise { photo: 20.0, depth: 0.005 };
 
 /// Finds the poses of all images that pairs tie together, from given corrections on; others drift with their neighbours.
-pub(super) fn fit(frames: &[Frame], pairs: &[Pair], from: &Corrections, from_joints: bool) -> Option<(Corrections, Noise)> {
+pub(super) fn fit(
+    frames: &[Frame],
+    pairs: &[Pair],
+    from: &Corrections,
+    from_joints: bool,
+) -> Option<(Corrections, Noise)> {
     let layout = Layout::default();
     let mut corrections = from.clone();
     let [shift, turn] = if from_joints { FROM_JOINTS } else { FROM_ELSEWHERE };

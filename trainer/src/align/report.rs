@@ -211,10 +211,17 @@ fn unseen(scene: &Scene, terms: &[Term], direction: &DVector<f64>) -> Unseen {
             }
             Term::Joint(joint) if matters(ix, 1) => Some(format!("offset of joint {joint}")),
             Term::Delay(camera) if matters(ix, 1) => Some(format!("delay of camera {:?}", name(camera))),
-            Term::DepthScale(camera) if matters(ix, 1) => Some(format!("scale of the depth of camera {:?}", name(camera))),
+            Term::DepthScale(camera) if matters(ix, 1) => {
+                Some(format!("scale of the depth of camera {:?}", name(camera)))
+            }
             Term::Readout(camera) if matters(ix, 1) => Some(format!("readout time of camera {:?}", name(camera))),
             Term::Lens(camera, part) if matters(ix, 1) => {
-                let what = ["focal length along x", "focal length along y", "principal point along x", "principal point along y"];
+                let what = [
+                    "focal length along x",
+                    "focal length along y",
+                    "principal point along x",
+                    "principal point along y",
+                ];
                 Some(format!("{} of camera {:?}", what[part], name(camera)))
             }
             _ => None,
@@ -285,7 +292,11 @@ impl std::fmt::Display for Found {
             Self::Joint { joint_ix, value, sigma, unseen_share } => {
                 let (value, sigma) = (value.to_degrees(), sigma.to_degrees());
                 write!(f, "offset of joint {joint_ix}: {value:+.3} +- {sigma:.3} degrees")?;
-                if *unseen_share > 0.1 { f.write_str(", of which a part cannot be told from something else") } else { Ok(()) }
+                if *unseen_share > 0.1 {
+                    f.write_str(", of which a part cannot be told from something else")
+                } else {
+                    Ok(())
+                }
             }
             Self::Lens { camera, focal_frac, focal_sigma, principal_focals, principal_sigma } => {
                 let percent = |value: f64| 100.0 * value;

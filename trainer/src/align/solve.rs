@@ -130,7 +130,8 @@ impl Solved {
         }
         let n = self.scales.len();
         let basis = DMatrix::from_fn(n, columns.len(), |row, column| self.eigen.eigenvectors[(row, columns[column])]);
-        let moves = DMatrix::from_fn(n, columns.len(), |row, column| if first(row) { basis[(row, column)] } else { 0.0 });
+        let moves =
+            DMatrix::from_fn(n, columns.len(), |row, column| if first(row) { basis[(row, column)] } else { 0.0 });
         let turned = SymmetricEigen::new(moves.tr_mul(&moves));
         let mut order: Vec<usize> = (0..columns.len()).collect();
         order.sort_by(|a, b| turned.eigenvalues[*a].total_cmp(&turned.eigenvalues[*b]));

@@ -120,8 +120,7 @@ fn of_pair(
         photo: Vec::new(),
         depth: Vec::new(),
     };
-    let looks: Vec<Look> =
-        looks(frames, views, pair, &frames[pair.from].spots, how).into_iter().flatten().collect();
+    let looks: Vec<Look> = looks(frames, views, pair, &frames[pair.from].spots, how).into_iter().flatten().collect();
     if looks.len() < LEAST_SPOTS {
         return sums;
     }

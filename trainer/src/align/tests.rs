@@ -21,7 +21,8 @@ fn base_from_flange([azimuth, elevation, roll, reach]: Joints) -> Transform {
     };
     let shift = |x: f64, y: f64, z: f64| Isometry3::translation(x, y, z);
     // At zero the flange looks along x, with x to the right: -y of the base.
-    let looking = UnitQuaternion::from_matrix(&nalgebra::Matrix3::from_columns(&[-Vector3::y(), -Vector3::z(), Vector3::x()]));
+    let looking =
+        UnitQuaternion::from_matrix(&nalgebra::Matrix3::from_columns(&[-Vector3::y(), -Vector3::z(), Vector3::x()]));
     turn(Vector3::z(), azimuth)
         * shift(0.1, 0.0, 0.5)
         * turn(Vector3::y(), elevation)
@@ -138,10 +139,12 @@ pub(crate) fn capture(wrong: &Wrong) -> Vec<Arc<Keyframe>> {
         let [width, height] = SIZE_PX.map(|side| side as usize);
         let looked = |pose: &Transform, x: usize, y: usize| {
             let at = [x as f64 + 0.5, y as f64 + 0.5];
-            let ray = Vector3::new((at[0] - PRINCIPAL_PX[0]) / FOCAL_PX[0], (at[1] - PRINCIPAL_PX[1]) / FOCAL_PX[1], 1.0);
+            let ray =
+                Vector3::new((at[0] - PRINCIPAL_PX[0]) / FOCAL_PX[0], (at[1] - PRINCIPAL_PX[1]) / FOCAL_PX[1], 1.0);
             cast(Point3::from(pose.translation.vector), pose.rotation * ray)
         };
-        let key = |pixel: usize, stream: u64| wrong.seed * 1_000_003 + (ix as u64 * 100_000 + pixel as u64) * 2 + stream;
+        let key =
+            |pixel: usize, stream: u64| wrong.seed * 1_000_003 + (ix as u64 * 100_000 + pixel as u64) * 2 + stream;
         let mut rgba = Vec::new();
         for y in 0..height {
             let share = (y as f64 + 0.5) / height as f64 - 0.5;
@@ -367,8 +370,9 @@ fn evenly_lit(frame: &mut Frame) {
     frame.levels = vec![frame::Grey::new([width, height], 1.0, &(0..width * height).map(value).collect::<Vec<_>>())];
 }
 
-/// Largest difference between the slopes of a pair's residuals and central differences, as a share of the largest slope.
-fn worst_slope(rolls: bool) -> Vec<(layout::Term, f64)> {
+/// Differences between slopes of a pair's residuals and central differences, as shares of the largest slope of the term.
+/// A few spots cross from one reading to the next and have a kink there: nine tenths are better than what comes back.
+fn worst_slopes(rolls: bool) -> Vec<(layout::Term, f64, f64)> {
     const STEP: f64 = 1e-3; // Of what a term may be.
     let wrong = Wrong { noise: 0.0, rolls, ..Wrong::nothing() };
     let mut scene = Scene::new(&capture(&wrong), false).unwrap();
@@ -376,18 +380,23 @@ fn worst_slope(rolls: bool) -> Vec<(layout::Term, f64)> {
     let all = all().into_iter().fold(TermSet::default(), TermSet::and);
     let layout = Layout::new(all, &scene.frames, 1);
     let mut here = Corrections::none(1);
-    let away = layout.terms.iter().enumerate().map(|(ix, term)| 0.3 * term.scale() * (ix as f64 * 1.3).sin());
+    // Joints start at zero: their columns are those of the joints as read, to first order.
+    let away = layout.terms.iter().enumerate().map(|(ix, term)| match term {
+        layout::Term::Joint(_) => 0.0,
+        term => 0.3 * term.scale() * (ix as f64 * 1.3).sin(),
+    });
     here.take(&layout, &nalgebra::DVector::from_iterator(layout.n(), away));
     let tone = residual::Tone { gain: 0.9, offset: 4.0 };
     let pair = scene.pairs[scene.pairs.len() / 2];
+    let how = sums::Looks { level: 0, hidden_frac: 0.1, noise: sums::Noise { photo: 1.0, depth: 1.0 } };
     let looked = |corrections: &Corrections| {
         let views = corrections.views(&scene.frames, &layout);
-        let how = sums::Looks { level: 0, hidden_frac: 0.1, noise: sums::Noise { photo: 1.0, depth: 1.0 } };
-        (sums::looks(&scene.frames, &views, pair, &scene.frames[pair.from].spots, &how), views)
+        let looks = sums::looks(&scene.frames, &views, pair, &scene.frames[pair.from].spots, &how);
+        (looks, views)
     };
     let (looks, views) = looked(&here);
-    let mut worst = Vec::new();
-    for (ix, term) in layout.terms.iter().enumerate() {
+    let placed = [pair.from, pair.to].map(|ix| residual::Placed::new(&views[ix], |term| term));
+    let worst = |ix: usize, term: layout::Term| {
         let nudged = |sign: f64| {
             let mut there = here.clone();
             let mut step = nalgebra::DVector::zeros(layout.n());
@@ -396,41 +405,39 @@ fn worst_slope(rolls: bool) -> Vec<(layout::Term, f64)> {
             looked(&there).0
         };
         let (ahead, behind) = (nudged(1.0), nudged(-1.0));
-        let placed = [pair.from, pair.to].map(|ix| residual::Placed::new(&views[ix], |term| term));
         let mut row = vec![0.0; layout.n() + 2];
-        let (mut most, mut off) = ([0.0f64; 2], [0.0f64; 2]);
+        let (mut slopes, mut off) = ([0.0f64; 2], [Vec::new(), Vec::new()]);
         for ((look, ahead), behind) in looks.iter().zip(&ahead).zip(&behind) {
             let (Some(look), Some(ahead), Some(behind)) = (look, ahead, behind) else { continue };
-            let numeric = [ahead.photo(tone) - behind.photo(tone), ahead.depth() - behind.depth()]
-                .map(|difference| difference / (2.0 * STEP * term.scale()));
+            let numeric = [ahead.photo(tone) - behind.photo(tone), ahead.depth() - behind.depth()];
             look.photo_slopes(&placed[0], &placed[1], tone, &mut row);
             let photo = row[ix];
             look.depth_slopes(&placed[0], &placed[1], &mut row);
-            // The weight of a reading follows from the readings beside it and is held; at a corner between planes those jump.
-            let same_plane = (ahead.depth() - look.depth() - (look.depth() - behind.depth())).abs()
-                < 1e-3 * (ahead.depth() - behind.depth()).abs();
-            for (kind, slope) in [photo, row[ix]].into_iter().enumerate().take(if same_plane { 2 } else { 1 }) {
-                most[kind] = most[kind].max(slope.abs());
-                off[kind] = off[kind].max((slope - numeric[kind]).abs());
+            for (kind, slope) in [photo, row[ix]].into_iter().enumerate() {
+                slopes[kind] = slopes[kind].max(slope.abs() * term.scale());
+                off[kind].push((slope * term.scale() - numeric[kind] / (2.0 * STEP)).abs());
             }
         }
-        let share = |kind: usize| if most[kind] > 0.0 { off[kind] / most[kind] } else { off[kind] };
-        worst.push((*term, share(0).max(share(1))));
-    }
-    worst
+        let share = |kind: usize| {
+            let off = &mut off[kind].clone();
+            off.sort_by(f64::total_cmp);
+            off[off.len() * 9 / 10] / slopes[kind].max(1e-3) // A first joint changes nothing between images.
+        };
+        (term, share(0), share(1))
+    };
+    layout.terms.iter().enumerate().map(|(ix, term)| worst(ix, *term)).collect()
 }
 
 #[test]
 fn slopes_match_central_differences() {
-    // Depth is kept in f32, and the weight of a reading is held while its cell is left.
-    const OFF: f64 = 0.02;
+    const OFF: f64 = 0.01; // Readings are kept in f32, and the weight of one is held in the slope.
     // The row at which a point is read moves with it by its share of the readout: held in the slope, as in the renderer.
-    const OFF_WHILE_ROLLING: f64 = 0.1;
+    const OFF_WHILE_ROLLING: f64 = 0.05;
     for (rolls, allowed) in [(false, OFF), (true, OFF_WHILE_ROLLING)] {
-        let worst = worst_slope(rolls);
+        let worst = worst_slopes(rolls);
         assert_eq!(worst.len(), if rolls { 23 } else { 22 });
-        for (term, off) in &worst {
-            assert!(*off < allowed, "{term:?}: {off:.4} of {worst:.4?}");
+        for (term, photo, depth) in &worst {
+            assert!(*photo < allowed && *depth < allowed, "{term:?}: {photo:.4} {depth:.4} of {worst:.4?}");
         }
     }
 }
@@ -467,7 +474,8 @@ fn drifting_images_are_moved_where_that_pays() {
             let mut moved = keyframe.as_ref().clone();
             moved.world_from_camera *= drift;
             if let Some(depth) = &mut moved.depth {
-                depth.world_from_camera = moved.world_from_camera * keyframe.world_from_camera.inverse() * depth.world_from_camera;
+                depth.world_from_camera =
+                    moved.world_from_camera * keyframe.world_from_camera.inverse() * depth.world_from_camera;
             }
             (moved.twist, moved.joint_twists) = (None, [].into());
             Arc::new(moved)

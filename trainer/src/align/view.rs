@@ -15,10 +15,7 @@ pub(super) struct Motion {
 
 impl Motion {
     fn of(transform: &Transform) -> Self {
-        Self {
-            rotation: transform.rotation.to_rotation_matrix().into_inner(),
-            shift: transform.translation.vector,
-        }
+        Self { rotation: transform.rotation.to_rotation_matrix().into_inner(), shift: transform.translation.vector }
     }
 
     pub(super) fn then(&self, point: &Vector3<f64>) -> Vector3<f64> {
@@ -67,16 +64,17 @@ impl View {
             columns.extend((0..3).map(|axis| (mount + axis, unit(axis), Vector3::zeros())));
             columns.extend((0..3).map(|axis| (mount + 3 + axis, Vector3::zeros(), unit(axis))));
         }
-        let mut moves = |term: usize, twist: &Twist| {
-            let twist = twist.of_attached(&raw_from_corrected);
+        let mut moves = |term: usize, twist: &Twist, place: &Transform| {
+            let twist = twist.of_attached(place);
             columns.push((term, twist.linear_m_s, twist.angular_rad_s));
         };
         if let (Some(delay), Some(twist)) = (terms.delay, &keyframe.twist) {
-            moves(delay, twist);
+            moves(delay, twist, &raw_from_corrected);
         }
         if let Some(joints) = layout.joints() {
+            let delayed_from_corrected = fix.delayed_from_given(keyframe) * raw_from_corrected;
             for (joint, twist) in keyframe.joint_twists.iter().enumerate() {
-                moves(joints + joint, twist);
+                moves(joints + joint, twist, &delayed_from_corrected);
             }
         }
         let share = |values: [f64; 2], change: &dyn Fn(usize, f64) -> f64| {

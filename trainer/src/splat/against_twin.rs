@@ -258,7 +258,8 @@ fn check_gradients(
     view_passes.compare(&mut passes, &bench.learn, &wanted.target());
     view_passes.backward(&mut passes, &bench.learn);
     view_passes.update(&mut passes, &gradients_only, &rule, true);
-    let all = TermSet { mount: true, delay: true, lens: true, image_poses: true, image_gains: true, ..TermSet::default() };
+    let all =
+        TermSet { mount: true, delay: true, lens: true, image_poses: true, image_gains: true, ..TermSet::default() };
     let mut cameras = CameraTerms::new(gpu, all).unwrap();
     let lens = cameras.lens(gpu, &moving_keyframe()).unwrap();
     let refine = LearnPipelines::camera_gradients_only(gpu).unwrap();

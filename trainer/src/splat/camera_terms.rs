@@ -159,10 +159,8 @@ impl CameraFix {
 
     /// The camera of a keyframe as it is, where the input has it as [`PosedLens::of`].
     pub fn apply(&self, keyframe: &Keyframe) -> PosedLens {
-        let (lens, twist) = (PosedLens::of(keyframe), keyframe.twist);
-        let delay = twist.map_or(Transform::identity(), |twist| {
-            moved(-self.delay_secs * twist.angular_rad_s, -self.delay_secs * twist.linear_m_s)
-        });
+        let lens = PosedLens::of(keyframe);
+        let delay = self.delayed_from_given(keyframe);
         let mut by_joints = Twist::zero();
         for (twist, offset) in keyframe.joint_twists.iter().zip(&self.joint_offsets) {
             by_joints.linear_m_s += twist.linear_m_s * *offset;
@@ -186,6 +184,13 @@ impl CameraFix {
                 lens.principal_px[axis] + self.principal_focals[axis] * lens.focal_px[axis]
             }),
         }
+    }
+
+    /// From the camera as the input has it to the camera at the time the image was taken.
+    pub(crate) fn delayed_from_given(&self, keyframe: &Keyframe) -> Transform {
+        keyframe.twist.map_or(Transform::identity(), |twist| {
+            moved(-self.delay_secs * twist.angular_rad_s, -self.delay_secs * twist.linear_m_s)
+        })
     }
 
     /// Where the depth frame of a keyframe is in its color frame.

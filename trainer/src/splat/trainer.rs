@@ -738,7 +738,11 @@ impl Method for SplatTrainer {
         let by_time = if self.step_millis > 0.0 { (SUBMIT_MILLIS / self.step_millis) as u64 } else { 1 };
         let to_change = GROWTH_PERIOD - self.step % GROWTH_PERIOD; // Growth and degrees change at multiples of it.
         let asked = n;
-        let n = n.min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT)).min(to_change).min(self.trials.steps_left(self.step)).min(self.steps_to_alignment());
+        let n = n
+            .min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT))
+            .min(to_change)
+            .min(self.trials.steps_left(self.step))
+            .min(self.steps_to_alignment());
         self.splats.set_active_degree(&self.gpu, u32::try_from(self.step / SH_PERIOD).unwrap_or(3).min(3));
         self.write_rule();
         let since = Instant::now();

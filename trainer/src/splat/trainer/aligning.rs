@@ -118,7 +118,8 @@ impl SplatTrainer {
         self.cameras = CameraTerms::new(&self.gpu, self.cameras.set)?;
         self.seeder = Seeder::default();
         self.unseeded.clear();
-        self.trials.held_back = self.trials.held_back.iter().map(|keyframe| self.aligning.corrected(keyframe)).collect();
+        self.trials.held_back =
+            self.trials.held_back.iter().map(|keyframe| self.aligning.corrected(keyframe)).collect();
         self.pending = self.views.iter().map(|view| self.aligning.corrected(&view.keyframe)).collect();
         self.views = self.pending.iter().cloned().map(TrainView::new).collect();
         (self.step, self.schedule_start, self.grown_at) = (0, 0, 0);

@@ -179,8 +179,11 @@ impl SplatTrainer {
         }
         let state: State =
             serde_json::from_value(checkpoint.state.clone()).map_err(|error| bad_state(error.to_string()))?;
-        let aligning =
-            if state.is_aligned { Aligning::Done(state.alignment.clone()) } else { Aligning::new(&state.options.align) };
+        let aligning = if state.is_aligned {
+            Aligning::Done(state.alignment.clone())
+        } else {
+            Aligning::new(&state.options.align)
+        };
         let (views, rest) = matched(&state, &aligning, keyframes)?;
         let n_splats = state.n_splats;
         if n_splats > state.capacity || state.active_degree > state.options.sh_degree || state.options.sh_degree > 3 {
