@@ -95,3 +95,70 @@ fn correct(camera: &mut Camera, fix: &CameraFix, alignment: &Alignment) {
     }
     correct_lens(&mut camera.intrinsics);
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::BTreeMap;
+    use trainer::align::Number;
+
+    const CLOSE: f64 = 1e-12; // Rounding of products of poses near 1.
+
+    fn shipped() -> Rig {
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
+        Rig::load(&file, &[]).unwrap()
+    }
+
+    #[test]
+    fn every_correction_finds_its_key() {
+        let mut rig = shipped();
+        rig.arm.joints.reverse(); // The device's order is not the chain's.
+        let fix = CameraFix {
+            turn_rad: [0.01, -0.02, 0.03],
+            shift_m: [0.001, 0.002, -0.003],
+            delay_secs: 0.004,
+            log_focal: [0.01, 0.02],
+            principal_focals: [0.001, -0.002],
+            joint_offsets: (0..7).map(f64::from).map(|joint| 0.001 * joint).collect(),
+            depth_shift_m: [0.0, 0.0, 0.005],
+            log_depth_scale: 0.01,
+            readout_secs: -0.003,
+            ..CameraFix::default()
+        };
+        let alignment = Alignment {
+            fixes: BTreeMap::from([("wrist".to_owned(), fix.clone())]),
+            found: vec![Found::Delay(Number { camera: "wrist".to_owned(), value: 0.004, sigma: 1e-4 })],
+            ..Alignment::default()
+        };
+        let found = corrected(&rig, &alignment).unwrap();
+        let (before, after) = (&rig.cameras[0], &found.cameras[0]);
+        // A turn and a shift after camera_from_parent.
+        let moved = Transform::new(Vector3::from(fix.shift_m), Vector3::from(fix.turn_rad));
+        let expected = moved * before.parent_from_camera.inverse();
+        let off = (after.parent_from_camera.inverse().to_homogeneous() - expected.to_homogeneous()).abs().max();
+        assert!(off < CLOSE, "{off}");
+        let delay = after.stamp_to_mid_exposure.as_ref().unwrap();
+        assert!((delay.value_millis - 4.0).abs() < CLOSE && (delay.sigma_millis - 0.1).abs() < CLOSE);
+        assert_eq!(delay.source, SOURCE);
+        assert!((after.readout_micros.unwrap() - 12_000.0).abs() < 1e-6);
+        assert!((after.intrinsics.focal_px[0] / before.intrinsics.focal_px[0] - 0.01f64.exp()).abs() < CLOSE);
+        let [fx, fy] = before.intrinsics.focal_px;
+        let moved = [0, 1].map(|axis| after.intrinsics.principal_px[axis] - before.intrinsics.principal_px[axis]);
+        assert!((moved[0] - 0.001 * fx).abs() < 1e-9 && (moved[1] + 0.002 * fy).abs() < 1e-9, "{moved:?}");
+        let depth = after.depth.as_ref().unwrap();
+        assert_eq!(depth.intrinsics.focal_px, after.intrinsics.focal_px, "depth comes through the same lens");
+        assert!((depth.factor - 0.01f64.exp()).abs() < CLOSE);
+        assert!((depth.camera_from_depth.translation.vector - Vector3::new(0.0, 0.0, 0.005)).norm() < CLOSE);
+        let expected: Vec<f64> = (0..7).rev().map(|joint| 0.001 * f64::from(joint)).collect();
+        assert_eq!(found.arm.joint_offsets, expected);
+        // It is a rig file that can be read, and a second rig's description is not overwritten.
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("rig.toml");
+        write(&found, &file).unwrap();
+        assert_eq!(Rig::load(&file, &[]).unwrap(), found);
+        std::fs::write(folder.path().join(drivers::recording::URDF_FILE), "<robot/>").unwrap();
+        assert!(write(&found, &file).unwrap_err().to_string().contains("another robot"));
+        assert!(refuse_place(&folder.path().join("none/rig.toml")).is_err());
+        assert!(refuse_place(&file).is_ok());
+    }
+}

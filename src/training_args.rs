@@ -153,3 +153,56 @@ impl Evidence {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NOTHING: TermSet = TermSet {
+        mount: false,
+        delay: false,
+        lens: false,
+        image_poses: false,
+        image_gains: false,
+        joints: false,
+        depth_pose: false,
+        depth_scale: false,
+        readout: false,
+    };
+
+    fn refining(asked: &[Refine], joints: bool, depth: bool) -> Result<Refining, String> {
+        let args = TrainingArgs { method: None, seed: None, max_bytes: None, max_splats: None, refine: asked.to_vec() };
+        args.refining(Evidence { joints, depth }, Refine::None).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn what_depth_can_tell_is_not_learned_with_the_scene() {
+        let mount = TermSet { mount: true, ..NOTHING };
+        let by_depth = refining(&[Refine::Mount, Refine::ImageGains], true, true).unwrap();
+        assert_eq!(by_depth.align, CameraChoice::Given(mount));
+        assert_eq!(by_depth.learn, CameraChoice::Given(TermSet { image_gains: true, ..NOTHING }));
+        let without = refining(&[Refine::Mount], true, false).unwrap();
+        assert_eq!(without, Refining { align: CameraChoice::default(), learn: CameraChoice::Given(mount) });
+
+        let candidates = |choice: CameraChoice| match choice {
+            CameraChoice::Try(candidates) => candidates.len(),
+            CameraChoice::Given(_) => panic!("auto tries"),
+        };
+        for (joints, depth, aligned, learned) in
+            [(true, true, 8, 0), (true, false, 0, 1), (false, true, 8, 1), (false, false, 0, 1)]
+        {
+            let Refining { align, learn } = refining(&[Refine::Auto], joints, depth).unwrap();
+            assert_eq!((candidates(align), candidates(learn)), (aligned, learned), "joints {joints}, depth {depth}");
+        }
+        assert_eq!(refining(&[], true, true), Ok(Refining::default()));
+    }
+
+    #[test]
+    fn what_cannot_be_found_is_refused() {
+        let told = |asked: &[Refine], joints, depth| refining(asked, joints, depth).unwrap_err();
+        assert!(told(&[Refine::DepthPose], true, false).contains("depth-pose: needs images with depth"));
+        assert!(told(&[Refine::Readout], false, false).contains("readout: needs"));
+        assert!(told(&[Refine::Joints], false, true).contains("needs a recording of an arm"));
+        assert!(told(&[Refine::Auto, Refine::Mount], true, true).contains("stand alone"));
+    }
+}

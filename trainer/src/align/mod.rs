@@ -22,7 +22,7 @@ mod sums;
 pub(crate) mod tests;
 mod view;
 
-pub use report::{Alignment, Found, Unseen};
+pub use report::{Alignment, Found, Moved, Number, Unseen};
 
 use crate::splat::{CameraChoice, TermSet, Trial};
 use crate::{Keyframe, Split};

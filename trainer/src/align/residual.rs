@@ -98,8 +98,8 @@ impl Look {
     /// Slopes of [`Look::photo`] along the terms; those of gain and offset come after them.
     pub(super) fn photo_slopes(&self, i: &Placed<'_>, j: &Placed<'_>, tone: Tone, row: &mut [f64]) {
         row.fill(0.0);
-        let read_j = along_point(j.view, &self.j, 1.0);
-        let read_i = along_point(i.view, &self.i, -tone.gain);
+        let read_j = held_slope(j.view, &self.j, &along_point(j.view, &self.j, 1.0));
+        let read_i = held_slope(i.view, &self.i, &along_point(i.view, &self.i, -tone.gain));
         let (slope_j, slope_i) = (still_slope(j.view, &self.j, &read_j), still_slope(i.view, &self.i, &read_i));
         let through = i.view.world_from_camera.rotation.tr_mul(&(j.view.world_from_camera.rotation * slope_j));
         add_motion(i, &self.i.still, &through, 1.0, row);
@@ -198,9 +198,17 @@ fn along_point(view: &View, seen: &Seen, factor: f64) -> Vector3<f64> {
     Vector3::new(sx, sy, -(sx * seen.read.x + sy * seen.read.y) / seen.read.z)
 }
 
-/// The same with the point at mid-exposure; the row's share of the readout is held.
-fn still_slope(view: &View, seen: &Seen, slope: &Vector3<f64>) -> Vector3<f64> {
-    slope - slope.cross(&view.twist.angular_rad_s) * (seen.share * view.readout_secs)
+/// The same with the point as it moves while the row that reads it is held: a point that moves on meets another row.
+fn held_slope(view: &View, seen: &Seen, slope: &Vector3<f64>) -> Vector3<f64> {
+    let drift = -view.readout_secs * view.twist.apparent_velocity(&seen.still);
+    let z = seen.read.z;
+    let row = Vector3::new(0.0, view.focal_px[1] / z, -view.focal_px[1] * seen.read.y / (z * z));
+    slope - row * (slope.dot(&drift) / (view.height_px + row.dot(&drift)))
+}
+
+/// The same with the point at mid-exposure.
+fn still_slope(view: &View, seen: &Seen, held: &Vector3<f64>) -> Vector3<f64> {
+    held - held.cross(&view.twist.angular_rad_s) * (seen.share * view.readout_secs)
 }
 
 fn add_motion(placed: &Placed<'_>, point: &Vector3<f64>, slope: &Vector3<f64>, sign: f64, row: &mut [f64]) {

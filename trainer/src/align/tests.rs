@@ -421,7 +421,8 @@ fn worst_slopes(rolls: bool) -> Vec<(layout::Term, f64, f64)> {
         let share = |kind: usize| {
             let off = &mut off[kind].clone();
             off.sort_by(f64::total_cmp);
-            off[off.len() * 9 / 10] / slopes[kind].max(1e-3) // A first joint changes nothing between images.
+            // A first joint changes nothing between images, and rounding of brightness to f32 is all there is.
+            off[off.len() * 9 / 10] / slopes[kind].max([0.1, 1e-3][kind])
         };
         (term, share(0), share(1))
     };
@@ -431,7 +432,7 @@ fn worst_slopes(rolls: bool) -> Vec<(layout::Term, f64, f64)> {
 #[test]
 fn slopes_match_central_differences() {
     const OFF: f64 = 0.01; // Readings are kept in f32, and the weight of one is held in the slope.
-    // The row at which a point is read moves with it by its share of the readout: held in the slope, as in the renderer.
+    // Left out: the lens moves points to other rows, and a mount elsewhere moves otherwise during the readout.
     const OFF_WHILE_ROLLING: f64 = 0.05;
     for (rolls, allowed) in [(false, OFF), (true, OFF_WHILE_ROLLING)] {
         let worst = worst_slopes(rolls);
