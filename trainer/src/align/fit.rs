@@ -10,10 +10,10 @@ use super::sums::{self, Looks, Noise};
 /// Steps at each level, the finest first.
 const ROUNDS: [usize; 4] = [12, 4, 4, 4];
 /// By how much of its depth a point may be off before it counts as hidden, the finest first: errors are large at first.
-const HIDDEN_FRAC: [f64; 4] = [0.04, 0.05, 0.07, 0.1];
+pub(super) const HIDDEN_FRAC: [f64; 4] = [0.04, 0.05, 0.07, 0.1];
 /// A step below this many standard deviations ends a level.
 const SMALL_STEP: [f64; 4] = [0.2, 2.0, 2.0, 2.0];
-const FIRST_NOISE: Noise = Noise { photo: 20.0, depth: 0.005 };
+pub(super) const FIRST_NOISE: Noise = Noise { photo: 20.0, depth: 0.005 };
 
 /// What came of a fit.
 #[derive(Debug)]

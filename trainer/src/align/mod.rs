@@ -67,7 +67,7 @@ pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraChoice) -> Option<Align
     let kept = match choice {
         CameraChoice::Given(set) => {
             let with = scene.model(*set, &nothing)?;
-            trials.push(scene.judge(*set, &nothing, &with).0);
+            trials.push(scene.judge(*set, &nothing, &with));
             with
         }
         CameraChoice::Try(candidates) => scene.choose(candidates, nothing, &mut trials),
@@ -154,7 +154,7 @@ impl Scene {
                 continue;
             }
             let Some(with) = self.model(kept.set.and(*candidate), &kept) else { continue };
-            let (mut trial, _) = self.judge(*candidate, &kept, &with);
+            let mut trial = self.judge(*candidate, &kept, &with);
             trial.kept &= candidate.image_poses || with.is_sure_of(&layout);
             if trial.kept {
                 parts.push(*candidate);
@@ -166,7 +166,7 @@ impl Scene {
             let rest =
                 parts.iter().filter(|other| **other != part).fold(TermSet::default(), |set, other| set.and(*other));
             let Some(without) = self.model(rest, &kept) else { continue };
-            let (trial, _) = self.judge(part, &without, &kept);
+            let trial = self.judge(part, &without, &kept);
             if !trial.kept {
                 parts.retain(|other| *other != part);
                 trials.retain(|earlier| earlier.terms != part);
@@ -178,14 +178,14 @@ impl Scene {
     }
 
     /// How much better a set of terms predicts the selection images.
-    fn judge(&self, terms: TermSet, without: &Model, with: &Model) -> (Trial, usize) {
+    fn judge(&self, terms: TermSet, without: &Model, with: &Model) -> Trial {
         let noise = with.fit.as_ref().map_or(sums::Noise { photo: 5.0, depth: 0.005 }, |fit| fit.noise);
         let (without_db, with_db) =
             judge::scores(&self.frames, &self.judging, &without.corrections, &with.corrections, noise);
         log::debug!("alignment: {terms}: without {without_db:.2?}, with {with_db:.2?} dB");
         let mut trial = Trial::of(terms, &without_db, &with_db);
         trial.kept &= trial.n_images >= LEAST_JUDGES;
-        (trial, without_db.len())
+        trial
     }
 }
 

@@ -1,9 +1,11 @@
 //! A small motion of every image on its own: many unknowns, of which each pair ties two together.
 
 use super::corrections::{Corrections, parts, twist};
+use super::fit::{FIRST_NOISE, HIDDEN_FRAC};
 use super::frame::Frame;
 use super::layout::Layout;
 use super::pairs::Pair;
+use super::solve::INFLATION;
 use super::sums::{self, Looks, Noise, PairSums};
 use crate::splat::moved;
 use kinematics::{Twist, transform};
@@ -13,12 +15,8 @@ use std::collections::BTreeMap;
 /// How far an image's pose may be off where it comes from joints, metres and radians, and where it does not.
 const FROM_JOINTS: [f64; 2] = [2e-4, 3.5e-4];
 const FROM_ELSEWHERE: [f64; 2] = [0.02, 0.02];
-/// As for the shared terms.
-const INFLATION: f64 = 10.0;
 const ROUNDS: [usize; 4] = [5, 3, 3, 4];
-const HIDDEN_FRAC: [f64; 4] = [0.04, 0.05, 0.07, 0.1];
 const LONGEST_STEP: f64 = 2.0;
-const FIRST_NOISE: Noise = Noise { photo: 20.0, depth: 0.005 };
 
 /// Finds the poses of all images that pairs tie together, from given corrections on; others drift with their neighbours.
 pub(super) fn fit(
@@ -113,9 +111,9 @@ impl Equations {
             let block = |row: usize, column: usize| {
                 Matrix6::from_fn(|y, x| sums.information[(6 * row + y, 6 * column + x)] * scales[y] * scales[x])
             };
-            for side in 0..2 {
-                equations.diagonal[places[side]] += block(side, side);
-                equations.right[places[side]] += sums.gradient.fixed_rows::<6>(6 * side).component_mul(scales);
+            for (side, place) in places.into_iter().enumerate() {
+                equations.diagonal[place] += block(side, side);
+                equations.right[place] += sums.gradient.fixed_rows::<6>(6 * side).component_mul(scales);
             }
             equations.ties.push((places[0], places[1], block(0, 1)));
         }

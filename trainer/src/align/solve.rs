@@ -8,7 +8,7 @@ use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
 /// Residuals of neighbouring spots err together: they say as much as this many times fewer would. Only for damping and for
 /// what counts as seen; what is reported is measured, see [`Solved::variance`].
-const INFLATION: f64 = 10.0;
+pub(super) const INFLATION: f64 = 10.0;
 /// A direction is seen when its standard deviation is below this share of what the term may be.
 const SEEN_FRAC: f64 = 0.3;
 /// The most a step may change, in shares of what the terms may be.

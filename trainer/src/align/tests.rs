@@ -220,13 +220,11 @@ fn all() -> Vec<TermSet> {
 fn given(wrong: &Wrong, change: fn(&mut TermSet)) -> Alignment {
     let mut set = TermSet::default();
     change(&mut set);
-    let alignment = align(&capture(wrong), &CameraChoice::Given(set)).unwrap();
-    alignment
+    align(&capture(wrong), &CameraChoice::Given(set)).unwrap()
 }
 
 fn tried(wrong: &Wrong) -> Alignment {
-    let alignment = align(&capture(wrong), &CameraChoice::Try(all())).unwrap();
-    alignment
+    align(&capture(wrong), &CameraChoice::Try(all())).unwrap()
 }
 
 pub(crate) fn wrong_mount() -> Transform {
