@@ -2,7 +2,7 @@
 
 use crate::config::{Override, Rig};
 use crate::dataset;
-use crate::exit::LackOfEvidence;
+use crate::exit::{BadArgument, LackOfEvidence};
 use crate::holdout::Holdout;
 use crate::join::{Join, JoinEvent, KeyframeList, Use};
 use crate::open::{self, Opened};
@@ -24,6 +24,9 @@ pub(crate) struct DataArgs {
     /// Take exactly the keyframes of a list that an earlier run wrote (keyframes.txt)
     #[arg(long, value_name = "FILE", conflicts_with = "holdout")]
     pub(crate) keyframes: Option<PathBuf>,
+    /// Read a recording with this rig file instead of the one in it
+    #[arg(long, value_name = "FILE")]
+    pub(crate) rig: Option<PathBuf>,
     /// Shrink the images (not their depth) to this share of their width and height, 0.05 to 1 [default: the rig file's, else 1]
     #[arg(long, value_name = "SHARE", value_parser = shrink::share)]
     pub(crate) scale: Option<f64>,
@@ -57,6 +60,8 @@ struct Selection {
     list: Option<KeyframeList>,
     holdout: Option<Holdout>,
     scale: Option<f64>,
+    /// In place of the one in a recording.
+    rig: Option<PathBuf>,
 }
 
 impl Data {
@@ -70,18 +75,19 @@ impl Data {
     ) -> anyhow::Result<Self> {
         let list = args.keyframes.as_deref().map(KeyframeList::load).transpose()?;
         let holdout = args.holdout.as_deref().map(Holdout::from_argument).transpose()?;
-        Self::selected(path, Selection { list, holdout, scale: args.scale }, purpose, overrides, quiet)
+        Self::selected(path, Selection { list, holdout, scale: args.scale, rig: args.rig.clone() }, purpose, overrides, quiet)
     }
 
     /// Reads the keyframes of a list, with their images shrunk to a share of their size.
     pub(crate) fn of_list(
         path: &Path,
         list: KeyframeList,
+        rig: Option<PathBuf>,
         scale: f64,
         overrides: &[Override],
         quiet: bool,
     ) -> anyhow::Result<Self> {
-        let selection = Selection { list: Some(list), holdout: None, scale: Some(scale) };
+        let selection = Selection { list: Some(list), holdout: None, scale: Some(scale), rig };
         Self::selected(path, selection, Purpose::Training, overrides, quiet)
     }
 
@@ -92,11 +98,15 @@ impl Data {
         overrides: &[Override],
         quiet: bool,
     ) -> anyhow::Result<Self> {
-        let Selection { list, holdout, scale } = selection;
+        let Selection { list, holdout, scale, rig } = selection;
         let is_recording = path.extension().is_some_and(|ending| ending == RECORDING_ENDING);
         let mut data = if is_recording {
             let scale = scale.map(|scale| Override::new("train.scale", scale));
-            Self::from_recording(path, list, overrides.iter().cloned().chain(scale).collect(), quiet)?
+            let overrides: Vec<Override> = overrides.iter().cloned().chain(scale).collect();
+            let rig = rig.as_deref().map(|file| Rig::load(file, &overrides)).transpose()?;
+            Self::from_recording(path, rig, list, overrides, quiet)?
+        } else if let Some(rig) = rig {
+            return Err(BadArgument(format!("--rig {}: only recordings are read with one", rig.display())).into());
         } else {
             Self::from_folder(path, &holdout.clone().unwrap_or_default(), scale.unwrap_or(1.0), list, quiet)?
         };
@@ -112,6 +122,12 @@ impl Data {
             return Err(LackOfEvidence(format!("{}: {what} among {n_images}", path.display())).into());
         }
         Ok(data)
+    }
+
+    /// The rig file that a recording is read with, without what flags override; a folder has none.
+    pub(crate) fn rig_as_given(path: &Path, args: &DataArgs) -> anyhow::Result<Rig> {
+        let rig = args.rig.as_deref().map(|file| Rig::load(file, &[])).transpose()?;
+        Ok(open::recording(path, rig, &[])?.rig)
     }
 
     /// Keyframes of one split.
@@ -149,11 +165,12 @@ impl Data {
 
     fn from_recording(
         path: &Path,
+        rig: Option<Rig>,
         list: Option<KeyframeList>,
         overrides: Vec<Override>,
         quiet: bool,
     ) -> anyhow::Result<Self> {
-        let Opened { rig, mut source, damage } = open::recording(path, None, &overrides)?;
+        let Opened { rig, mut source, damage } = open::recording(path, rig, &overrides)?;
         let mut join = Join::new(&rig)?;
         if let Some(list) = list {
             join = join.taking_only(list);

@@ -149,6 +149,7 @@ fn keyframe(lens: &LensMaps, frame: &DatasetFrame, scale_frac: f64) -> anyhow::R
         world_from_camera: frame.world_from_camera,
         twist: None,
         readout_secs: 0.0,
+        joint_twists: [].into(),
         split: Split::Train,
         truth: None,
     };

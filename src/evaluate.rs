@@ -9,7 +9,6 @@ use std::fmt::{Display, Formatter};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use trainer::eval::{Lpips, PixelPair, depth_rmse_m, psnr, ssim};
-use trainer::request::Shutter;
 use trainer::splat::PosedLens;
 use trainer::{Keyframe, Method, Picture, Projection, RenderRequest};
 
@@ -169,7 +168,7 @@ fn request(keyframe: &Keyframe, lens: &PosedLens) -> RenderRequest {
         world_from_camera: lens.world_from_camera,
         size_px: keyframe.size_px,
         projection: Projection::Pinhole { focal_px: lens.focal_px, principal_px: lens.principal_px },
-        shutter: keyframe.twist.map(|twist| Shutter { twist, readout_secs: keyframe.readout_secs }),
+        shutter: lens.shutter,
         near_m: NEAR_M,
         far_m: FAR_M,
         crop: None,

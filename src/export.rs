@@ -175,6 +175,7 @@ mod tests {
             world_from_camera,
             twist: None,
             readout_secs: 0.0,
+            joint_twists: [].into(),
             split: Split::of(ix),
             truth: None,
         }

@@ -7,6 +7,7 @@ mod checkpoints;
 mod cli;
 mod commands;
 mod config;
+mod corrected_rig;
 mod data;
 mod dataset;
 mod decisions;

@@ -39,12 +39,12 @@ impl Replay {
     }
 
     /// Loads exactly the keyframes that the log names, and checks that they are the same.
-    pub(crate) fn load_data(&self, path: &Path, quiet: bool) -> anyhow::Result<Data> {
+    pub(crate) fn load_data(&self, path: &Path, rig: Option<PathBuf>, quiet: bool) -> anyhow::Result<Data> {
         let pushed = || self.decisions.pushed();
         let list: KeyframeList = pushed()
             .filter_map(|pushed| Some((pushed.camera.clone(), Stamp(pushed.stamp_nanos), pushed.split()?)))
             .collect();
-        let mut data = Data::of_list(path, list, self.decisions.settings.scale, &self.overrides(), quiet)?;
+        let mut data = Data::of_list(path, list, rig, self.decisions.settings.scale, &self.overrides(), quiet)?;
         let there = by_name(&data.keyframes);
         let (name, shown) = (self.name(), path.display());
         for pushed in pushed() {

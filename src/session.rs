@@ -12,6 +12,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use trainer::align::Alignment;
 use trainer::gpu::{Gpu, PassTiming};
 use trainer::{Keyframe, Method, Part, Picture, Progress, RenderRequest, Split};
 
@@ -321,6 +322,11 @@ impl Session {
     /// The curve of [`Self::psnr`] over seconds.
     pub(crate) fn psnr_history(&self) -> &[(f64, f64)] {
         &self.history
+    }
+
+    /// What alignment of the keyframes found, once that is settled.
+    pub(crate) fn alignment(&self) -> Option<&Alignment> {
+        self.method.alignment()
     }
 
     /// Where training stands.

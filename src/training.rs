@@ -6,7 +6,7 @@ use crate::exit::BadArgument;
 use crate::method::{self, Kind};
 use crate::session::{Evaluators, Limits, Session, Tell};
 use crate::stop::Stop;
-use crate::training_args::{HowMany, Refine, TrainingArgs};
+use crate::training_args::{Evidence, HowMany, Refine, Refining, TrainingArgs};
 use std::sync::Arc;
 use std::time::Instant;
 use trainer::Keyframe;
@@ -51,10 +51,14 @@ pub(crate) fn model(
     software: bool,
 ) -> Result<(Kind, SplatOptions), BadArgument> {
     // A trial takes hundreds of steps more: on a processor that is minutes.
-    let cameras = args.cameras(data.rig.is_some(), if software { Refine::None } else { Refine::Auto })?;
+    let evidence =
+        Evidence { joints: data.rig.is_some(), depth: data.keyframes.iter().any(|keyframe| keyframe.depth.is_some()) };
+    let Refining { align, learn: cameras } =
+        args.refining(evidence, if software { Refine::None } else { Refine::Auto })?;
     let count = args.count(if software { HowMany::ToCap } else { HowMany::Tested });
     if let Some(rig) = &data.rig {
-        return Ok((Kind::of_rig(rig)?, SplatOptions { cameras, count, ..method::options(&rig.train, steps)? }));
+        let options = SplatOptions { cameras, align, count, ..method::options(&rig.train, steps)? };
+        return Ok((Kind::of_rig(rig)?, options));
     }
     let usual = SplatOptions::default();
     let options = SplatOptions {
@@ -63,6 +67,7 @@ pub(crate) fn model(
         max_bytes: args.max_bytes,
         cameras,
         count,
+        align,
         n_planned_steps: steps.unwrap_or(usual.n_planned_steps),
         ..usual
     };

@@ -21,8 +21,9 @@ pub(crate) struct TrainingArgs {
     /// Most splats, 1 to 100000000 [default: the rig file's, else 400000]
     #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(MAX_SPLATS))]
     pub(crate) max_splats: Option<u64>,
-    /// What is learned about cameras along with the scene: auto (what pays on held-back images), none, or a list of mount,
-    /// delay, lens, image-poses and image-gains, separated by commas [default: none; for data on disk auto on a GPU]
+    /// What is found about cameras: auto (what pays on held-back images), none, or a list of mount, delay, joints, depth-pose,
+    /// lens, depth-scale, readout, image-poses and image-gains, separated by commas. Where images have depth they are laid over
+    /// each other at the start; else it is learned with the scene [default: none; for data on disk auto on a GPU]
     #[arg(long, value_name = "TERMS", value_delimiter = ',', hide_possible_values = true)]
     pub(crate) refine: Vec<Refine>,
     /// How many splats there are in the end: tested (grown up to --max-splats, then halved as long as that costs less than
@@ -45,36 +46,73 @@ pub(crate) enum Refine {
     None,
     Mount,
     Delay,
+    Joints,
+    DepthPose,
     Lens,
+    DepthScale,
+    Readout,
     ImagePoses,
     ImageGains,
 }
 
+/// What is found about cameras, and how.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Refining {
+    /// By laying keyframes with depth over each other.
+    pub(crate) align: CameraChoice,
+    /// Along with the splats.
+    pub(crate) learn: CameraChoice,
+}
+
+/// What data have that cameras could be refined by.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Evidence {
+    /// Poses come from the joints of an arm: they are wrong in what all images share. Those of a SLAM system drift from
+    /// image to image.
+    pub(crate) joints: bool,
+    /// Keyframes, known from the start, with depth.
+    pub(crate) depth: bool,
+}
+
 impl TrainingArgs {
-    /// What is learned about cameras; `usual` where no flag says.
-    ///
-    /// Poses that come from joints are wrong in what all images share, those of a SLAM system drift from image to image.
-    pub(crate) fn cameras(&self, poses_from_joints: bool, usual: Refine) -> Result<CameraChoice, BadArgument> {
+    /// What is found about cameras; `usual` where no flag says.
+    pub(crate) fn refining(&self, evidence: Evidence, usual: Refine) -> Result<Refining, BadArgument> {
         let asked = if self.refine.is_empty() { std::slice::from_ref(&usual) } else { &self.refine };
         let has = |term| asked.contains(&term);
         if (has(Refine::Auto) || has(Refine::None)) && asked.len() > 1 {
             return Err(BadArgument("--refine: auto and none stand alone".into()));
         }
         if has(Refine::Auto) {
-            let first = if poses_from_joints {
-                TermSet { mount: true, delay: true, ..TermSet::default() }
-            } else {
-                TermSet { image_poses: true, ..TermSet::default() }
-            };
-            return Ok(CameraChoice::Try(vec![first]));
+            return Ok(evidence.what_pays());
         }
-        Ok(CameraChoice::Given(TermSet {
+        let needs_depth = [Refine::Joints, Refine::DepthPose, Refine::DepthScale, Refine::Readout];
+        if let (Some(term), false) = (needs_depth.into_iter().find(|term| has(*term)), evidence.depth) {
+            let name =
+                clap::ValueEnum::to_possible_value(&term).map_or(String::new(), |name| name.get_name().to_owned());
+            return Err(BadArgument(format!("--refine {name}: needs images with depth, and all of them at the start")));
+        }
+        if has(Refine::Joints) && !evidence.joints {
+            return Err(BadArgument("--refine joints: needs a recording of an arm".into()));
+        }
+        let set = TermSet {
             mount: has(Refine::Mount),
             delay: has(Refine::Delay),
             lens: has(Refine::Lens),
             image_poses: has(Refine::ImagePoses),
             image_gains: has(Refine::ImageGains),
-        }))
+            joints: has(Refine::Joints),
+            depth_pose: has(Refine::DepthPose),
+            depth_scale: has(Refine::DepthScale),
+            readout: has(Refine::Readout),
+        };
+        if !evidence.depth {
+            return Ok(Refining { align: CameraChoice::default(), learn: CameraChoice::Given(set) });
+        }
+        let own = TermSet { image_poses: set.image_poses, image_gains: set.image_gains, ..TermSet::default() };
+        Ok(Refining {
+            align: CameraChoice::Given(TermSet { image_gains: false, ..set }),
+            learn: CameraChoice::Given(own),
+        })
     }
 
     /// How the number of splats is found; `usual` where no flag says.
@@ -101,5 +139,89 @@ impl TrainingArgs {
             overrides.push(Override::new("train.max_splats", n.cast_signed()));
         }
         overrides
+    }
+}
+
+impl Evidence {
+    /// Candidates, the likelier first: alignment for what it can do, a trial with the scene for the rest.
+    fn what_pays(self) -> Refining {
+        let one = |change: fn(&mut TermSet)| {
+            let mut set = TermSet::default();
+            change(&mut set);
+            set
+        };
+        let poses = one(|set| set.image_poses = true);
+        let align = vec![
+            one(|set| set.mount = true),
+            one(|set| set.delay = true),
+            one(|set| set.joints = true),
+            one(|set| set.depth_pose = true),
+            one(|set| set.lens = true),
+            one(|set| set.depth_scale = true),
+            one(|set| set.readout = true),
+            poses,
+        ];
+        let learn = match self {
+            Self { joints: true, depth: true } => Vec::new(),
+            Self { joints: true, depth: false } => vec![TermSet { mount: true, delay: true, ..TermSet::default() }],
+            Self { joints: false, .. } => vec![poses],
+        };
+        Refining {
+            align: CameraChoice::Try(if self.depth { align } else { Vec::new() }),
+            learn: CameraChoice::Try(learn),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NOTHING: TermSet = TermSet {
+        mount: false,
+        delay: false,
+        lens: false,
+        image_poses: false,
+        image_gains: false,
+        joints: false,
+        depth_pose: false,
+        depth_scale: false,
+        readout: false,
+    };
+
+    fn refining(asked: &[Refine], joints: bool, depth: bool) -> Result<Refining, String> {
+        let args = TrainingArgs { method: None, seed: None, max_bytes: None, max_splats: None, refine: asked.to_vec() };
+        args.refining(Evidence { joints, depth }, Refine::None).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn what_depth_can_tell_is_not_learned_with_the_scene() {
+        let mount = TermSet { mount: true, ..NOTHING };
+        let by_depth = refining(&[Refine::Mount, Refine::ImageGains], true, true).unwrap();
+        assert_eq!(by_depth.align, CameraChoice::Given(mount));
+        assert_eq!(by_depth.learn, CameraChoice::Given(TermSet { image_gains: true, ..NOTHING }));
+        let without = refining(&[Refine::Mount], true, false).unwrap();
+        assert_eq!(without, Refining { align: CameraChoice::default(), learn: CameraChoice::Given(mount) });
+
+        let candidates = |choice: CameraChoice| match choice {
+            CameraChoice::Try(candidates) => candidates.len(),
+            CameraChoice::Given(_) => panic!("auto tries"),
+        };
+        for (joints, depth, aligned, learned) in
+            [(true, true, 8, 0), (true, false, 0, 1), (false, true, 8, 1), (false, false, 0, 1)]
+        {
+            let Refining { align, learn } = refining(&[Refine::Auto], joints, depth).unwrap();
+            assert_eq!((candidates(align), candidates(learn)), (aligned, learned), "joints {joints}, depth {depth}");
+        }
+        assert_eq!(refining(&[], true, true), Ok(Refining::default()));
+    }
+
+    #[test]
+    fn what_cannot_be_found_is_refused() {
+        let told = |asked: &[Refine], joints, depth| refining(asked, joints, depth).unwrap_err();
+        assert!(told(&[Refine::DepthPose], true, false).contains("depth-pose: needs images with depth"));
+        assert!(told(&[Refine::Readout], false, false).contains("readout: needs"));
+        assert!(told(&[Refine::Joints], false, true).contains("needs a recording of an arm"));
+        assert!(told(&[Refine::Auto, Refine::Mount], true, true).contains("stand alone"));
     }
 }

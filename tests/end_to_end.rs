@@ -20,6 +20,10 @@ const MOST_POSITION_ERROR_M: f64 = 1e-4;
 
 /// `rigs/static-arm.toml` at a quarter of its size, without flaws, in lockstep.
 fn rig_file(folder: &Path) {
+    rig_file_for(folder, N_IMAGES);
+}
+
+fn rig_file_for(folder: &Path, n_images: i64) {
     let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
     let text = std::fs::read_to_string(rigs.join("static-arm.toml")).expect("a shipped rig file");
     let mut rig: toml::Table = text.parse().expect("TOML");
@@ -39,7 +43,7 @@ fn rig_file(folder: &Path) {
     let sim = rig["sim"].as_table_mut().expect("a simulation");
     sim.insert("ideal".into(), true.into());
     sim.insert("lockstep".into(), true.into());
-    sim.insert("n_images".into(), N_IMAGES.into());
+    sim.insert("n_images".into(), n_images.into());
     std::fs::write(folder.join("rig.toml"), rig.to_string()).expect("room on the disk");
 }
 
@@ -314,4 +318,74 @@ fn a_port_in_use_is_one_clear_sentence() {
     let told = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{told}");
     assert!(told.starts_with("error: ") && told.contains(&address), "{told}");
+}
+
+/// The hand-eye calibration of a rig file: metres, and a quaternion as x, y, z, w.
+fn hand_eye(file: &Path) -> (Vec<f64>, Vec<f64>) {
+    let rig: toml::Table = std::fs::read_to_string(file).expect("a rig file").parse().expect("TOML");
+    let pose = &rig["camera"]["wrist"]["parent_from_camera"];
+    let numbers = |key: &str| -> Vec<f64> {
+        pose[key].as_array().expect("numbers").iter().map(|number| number.as_float().expect("a number")).collect()
+    };
+    (numbers("xyz_m"), numbers("quat_xyzw"))
+}
+
+#[test]
+fn a_rig_with_a_wrong_hand_eye_calibration_calibrates_itself() {
+    /// Half the scan; measured 0.003 degrees and 0.04 mm.
+    const N_IMAGES: i64 = 90;
+    const LEFT_DEGREES: f64 = 0.1;
+    const LEFT_MM: f64 = 0.5;
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    rig_file_for(folder, N_IMAGES);
+    let record = fieldrig(folder, &["record", "rig.toml", "--sim", "--out", "scan.mcap"]);
+    assert!(record.status.success(), "{}", String::from_utf8_lossy(&record.stderr));
+
+    // 5 mm, and 1 degree about the camera's axes: q * (sin, cos of half of it).
+    let text = std::fs::read_to_string(folder.join("rig.toml")).expect("a rig file");
+    let mut rig: toml::Table = text.parse().expect("TOML");
+    let (right_m, right) = hand_eye(&folder.join("rig.toml"));
+    let half = 0.5f64.to_radians();
+    let axis = [0.6, -0.64, 0.48];
+    let [x, y, z] = axis.map(|part| part * half.sin());
+    let [a, b, c, w] = [right[0], right[1], right[2], right[3]];
+    let wrong = [
+        w * x + a * half.cos() + b * z - c * y,
+        w * y + b * half.cos() + c * x - a * z,
+        w * z + c * half.cos() + a * y - b * x,
+        w * half.cos() - a * x - b * y - c * z,
+    ];
+    let pose = rig["camera"]["wrist"]["parent_from_camera"].as_table_mut().expect("a pose");
+    pose.insert("xyz_m".into(), vec![right_m[0] + 0.003, right_m[1] - 0.004, right_m[2]].into());
+    pose.insert("quat_xyzw".into(), wrong.to_vec().into());
+    std::fs::write(folder.join("wrong.toml"), rig.to_string()).expect("room on the disk");
+
+    std::fs::create_dir(folder.join("found")).expect("room on the disk");
+    let args = ["train", "scan.mcap", "--rig", "wrong.toml", "--refine", "auto", "--steps", "8", "--out", "out"];
+    let told = events(folder, &[&args[..], &["--write-rig", "found/rig.toml", "--json"]].concat());
+    assert_eq!(told.last().expect("events")["event"], "done");
+    let (found_m, found) = hand_eye(&folder.join("found/rig.toml"));
+    let dot: f64 = found.iter().zip(&right).map(|(found, right)| found * right).sum();
+    let degrees = 2.0 * dot.abs().min(1.0).acos().to_degrees();
+    let mm = 1e3 * found_m.iter().zip(&right_m).map(|(found, right)| (found - right).powi(2)).sum::<f64>().sqrt();
+    assert!(degrees < LEFT_DEGREES && mm < LEFT_MM, "{degrees:.4} degrees, {mm:.3} mm left");
+
+    let report = std::fs::read_to_string(folder.join("out/report.json")).expect("a report");
+    let report: Value = serde_json::from_str(&report).expect("JSON");
+    let found = report["alignment"]["found"].as_array().expect("what was found");
+    assert_eq!(found.len(), 1, "only the hand-eye: {found:?}");
+    assert_eq!(found[0]["what"], "hand-eye");
+    assert!((number(&found[0], "turn_rad").to_degrees() - 1.0).abs() < LEFT_DEGREES);
+    assert!(number(&found[0], "shift_sigma_m") < 5e-4);
+
+    // With the corrected rig nothing is wrong any more.
+    let args = ["train", "scan.mcap", "--rig", "found/rig.toml", "--refine", "auto", "--steps", "8", "--out", "again"];
+    events(folder, &[&args[..], &["--json"]].concat());
+    let report = std::fs::read_to_string(folder.join("again/report.json")).expect("a report");
+    let report: Value = serde_json::from_str(&report).expect("JSON");
+    assert_eq!(report["alignment"]["found"].as_array().map(Vec::len), Some(0));
+
+    let refused = fieldrig(folder, &["train", "scan.mcap", "--steps", "8", "--write-rig", "nowhere/rig.toml"]);
+    assert_eq!(refused.status.code(), Some(2), "{}", String::from_utf8_lossy(&refused.stderr));
 }

@@ -167,15 +167,24 @@ impl Chain {
     /// Velocity of the tip relative to the base, in the tip's own axes, when the joints at `q` move with `qd` (per second).
     pub fn tip_twist(&self, q: &[f64], qd: &[f64]) -> Result<Twist, Error> {
         self.check(qd)?;
-        let tip_from_base = self.forward(q)?.rotation.inverse();
-        let jacobian = self.jacobian(q)?;
-        let mut linear_in_base = Vector3::zeros();
-        let mut angular_in_base = Vector3::zeros();
-        for (column, rate) in jacobian.column_iter().zip(qd) {
-            linear_in_base += column.fixed_rows::<3>(0) * *rate;
-            angular_in_base += column.fixed_rows::<3>(3) * *rate;
+        let mut tip = Twist::zero();
+        for (twist, rate) in self.tip_twists_by_joint(q)?.iter().zip(qd) {
+            tip.linear_m_s += twist.linear_m_s * *rate;
+            tip.angular_rad_s += twist.angular_rad_s * *rate;
         }
-        Ok(Twist { linear_m_s: tip_from_base * linear_in_base, angular_rad_s: tip_from_base * angular_in_base })
+        Ok(tip)
+    }
+
+    /// Velocity of the tip relative to the base, in the tip's own axes, for each joint at `q` that moves by 1 per second.
+    pub fn tip_twists_by_joint(&self, q: &[f64]) -> Result<Vec<Twist>, Error> {
+        let tip_from_base = self.forward(q)?.rotation.inverse();
+        let in_tip = |linear: Vector3<f64>, angular: Vector3<f64>| Twist {
+            linear_m_s: tip_from_base * linear,
+            angular_rad_s: tip_from_base * angular,
+        };
+        let jacobian = self.jacobian(q)?;
+        let columns = jacobian.column_iter();
+        Ok(columns.map(|column| in_tip(column.fixed_rows::<3>(0).into(), column.fixed_rows::<3>(3).into())).collect())
     }
 
     fn check(&self, values: &[f64]) -> Result<(), Error> {

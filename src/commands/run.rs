@@ -12,7 +12,7 @@ use crate::method::{self, Kind};
 use crate::open::{self, Devices, Opened};
 use crate::session::{Evaluators, Limits, Session, Tell};
 use crate::stop::Stop;
-use crate::training_args::{HowMany, Refine, TrainingArgs};
+use crate::training_args::{Evidence, HowMany, Refine, TrainingArgs};
 use crate::{print, run_folder};
 use anyhow::Context;
 use drivers::Source;
@@ -110,7 +110,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let feed = Feed::start(args.input(&rig, source)?, hub.clone(), stop.clone())?;
     let gpu = super::open_gpu()?;
     let notes = notes(&gpu);
-    let cameras = args.training.cameras(true, Refine::None)?;
+    let evidence = Evidence { joints: true, depth: false }; // Depth comes, but not at the start.
+    let cameras = args.training.refining(evidence, Refine::None)?.learn;
     let count = args.training.count(HowMany::ToCap);
     let options = SplatOptions { cameras, count, ..method::options(&rig.train, args.steps)? };
     let method = kind.start(gpu.clone(), options.clone())?;

@@ -1,10 +1,12 @@
 //! `fieldrig train`: a model of a dataset folder or a recording.
 
 use crate::checkpoints::{self, CheckpointArgs, Checkpoints};
+use crate::config::Rig;
+use crate::corrected_rig;
 use crate::data::{Data, DataArgs, Purpose};
 use crate::decisions::{About, DecisionLog, Settings};
 use crate::evaluate::Evaluator;
-use crate::exit::{self, Exit};
+use crate::exit::{self, BadArgument, Exit};
 use crate::method::{self, Resumed};
 use crate::print;
 use crate::replay::Replay;
@@ -18,6 +20,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 use trainer::{Keyframe, Split};
+use trainer::align::Alignment;
 
 /// Length of a training where no flag says.
 const USUAL_SECONDS: f64 = 120.0;
@@ -53,6 +56,9 @@ pub(crate) struct Args {
     /// Where the results go; a folder that holds a model is refused [default: the folder of --resume if it holds none, else a new one in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
+    /// Write the recording's rig file here with what was found about its cameras
+    #[arg(long, value_name = "FILE")]
+    write_rig: Option<PathBuf>,
     #[command(flatten)]
     checkpoints: CheckpointArgs,
     /// Tell at the end what each kernel of a step takes on the GPU
@@ -74,6 +80,8 @@ struct Particulars<'a> {
     n_selection: usize,
     n_test: usize,
     losses: &'a [String],
+    /// What was found about cameras by laying images over each other.
+    alignment: Option<Alignment>,
 }
 
 /// Loads, trains until a limit or Ctrl-C, scores at the marks, saves.
@@ -92,9 +100,16 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
     let evaluators = Evaluators { at_marks: evaluator.clone(), most_at_marks: usize::MAX, at_end: evaluator };
     let data = match &replay {
-        Some(replay) => replay.load_data(&args.data, args.json)?,
+        Some(replay) => replay.load_data(&args.data, args.images.rig.clone(), args.json)?,
         None => Data::load(&args.data, &args.images, Purpose::Training, &args.training.overrides(), args.json)?,
     };
+    if let Some(file) = &args.write_rig {
+        if data.rig.is_none() {
+            let data = args.data.display();
+            return Err(BadArgument(format!("--write-rig: {data} holds no rig file; recordings do")).into());
+        }
+        corrected_rig::refuse_place(file)?; // Not after all the training.
+    }
     let gpu = super::open_gpu()?;
     let Resumed { kind, mut method, options, rest } = match &checkpoint {
         Some(checkpoint) => args.resumed(method::resume(gpu.clone(), checkpoint, &data.keyframes)?),
@@ -142,6 +157,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         None => training::drive(session, &rest, &stop)?,
     };
 
+    let alignment = session.alignment().cloned();
+    if let Some(file) = &args.write_rig {
+        write_rig(&Data::rig_as_given(&args.data, &args.images)?, alignment.as_ref(), file)?;
+    }
     let startup_secs = session.clock_started().map_or(0.0, |at| (at - started).as_secs_f64());
     session.finish(
         &out,
@@ -154,9 +173,23 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             n_selection: data.of_split(Split::Selection).len(),
             n_test: data.of_split(Split::Test).len(),
             losses: &data.losses,
+            alignment,
         },
     )?;
     Ok(exit::after(&data.losses))
+}
+
+/// Writes the rig file, and says where nothing changed in it.
+fn write_rig(rig: &Rig, alignment: Option<&Alignment>, file: &Path) -> anyhow::Result<()> {
+    match alignment {
+        None => log::warn!("images were not laid over each other: the rig file is written as it was"),
+        Some(alignment) if !alignment.is_any() => log::info!("the rig file needs no correction"),
+        Some(_) => {}
+    }
+    let rig = alignment.map_or_else(|| Ok(rig.clone()), |alignment| corrected_rig::corrected(rig, alignment))?;
+    corrected_rig::write(&rig, file)?;
+    log::info!("rig file written to {}", file.display());
+    Ok(())
 }
 
 impl Args {

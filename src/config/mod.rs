@@ -47,6 +47,8 @@ pub(crate) struct Arm {
     pub(crate) urdf_text: String,
     /// Moving joints in the order of the readings.
     pub(crate) joints: Vec<String>,
+    /// What is added to the readings, in their order, rad or m; empty where nothing is.
+    pub(crate) joint_offsets: Vec<f64>,
     pub(crate) base_link: String,
     pub(crate) flange_link: String,
     pub(crate) max_speed_rad_s: f64,
@@ -128,7 +130,9 @@ pub(crate) struct Depth {
     pub(crate) intrinsics: Intrinsics,
     /// Pose of the depth images' optical frame in that of the colour images.
     pub(crate) camera_from_depth: Transform,
-    /// Readings outside count as nothing seen.
+    /// What readings are multiplied by.
+    pub(crate) factor: f64,
+    /// Readings outside, after that, count as nothing seen.
     pub(crate) min_m: f64,
     pub(crate) max_m: f64,
 }

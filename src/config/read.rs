@@ -29,6 +29,8 @@ pub(super) const PARENTS: [(&str, Parent); 3] =
 const METHODS: [(&str, &str); 1] = [("splat", "splat")];
 /// Poses and lens coefficients beyond this are slips of the pen.
 const FAR: f64 = 1e4;
+/// Offsets of joints beyond this, rad or m, are not offsets.
+const MOST_OFFSET: f64 = 1.0;
 /// A quaternion this close to length one is taken as it is, so that a settled file gives the same bits again.
 const UNIT_CLOSE: f64 = 1e-12;
 
@@ -95,7 +97,13 @@ fn settle_joints(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
     if arm.joints.is_empty() {
         arm.joints = chain.joint_names().to_vec();
     }
-    chain.order_in(&arm.joints).map(|_| ()).map_err(|e| robot("arm.joints", e))
+    chain.order_in(&arm.joints).map_err(|e| robot("arm.joints", e))?;
+    let (n, n_joints) = (arm.joint_offsets.len(), arm.joints.len());
+    if n == 0 || (n == n_joints && arm.joint_offsets.iter().all(|offset| offset.abs() <= MOST_OFFSET)) {
+        return Ok(());
+    }
+    let reason = format!("{n} numbers; must be {n_joints} from -{MOST_OFFSET} to {MOST_OFFSET}, or none");
+    Err(ConfigError::Robot { file: file.to_owned(), key: "arm.joint_offsets", reason })
 }
 
 fn arm(mut keys: Section<'_>) -> (Arm, String) {
@@ -116,6 +124,7 @@ fn arm(mut keys: Section<'_>) -> (Arm, String) {
         address: keys.text("address").unwrap_or_default(),
         urdf_text: String::new(),
         joints: keys.texts("joints").unwrap_or_default(),
+        joint_offsets: keys.number_list("joint_offsets").unwrap_or_default(),
         base_link: keys.text("base_link").unwrap_or_default(),
         flange_link: flange_link.unwrap_or_default(),
         max_speed_rad_s: keys.number("max_speed_rad_s", 0.0..=10.0).unwrap_or(0.5),
@@ -260,6 +269,7 @@ fn depth(mut keys: Section<'_>, color: &Intrinsics) -> Depth {
     let depth = Depth {
         intrinsics,
         camera_from_depth: pose(&mut keys, "camera_from_depth").unwrap_or_else(Transform::identity),
+        factor: keys.number("factor", 0.5..=2.0).unwrap_or(1.0),
         min_m,
         max_m: keys.number("max_m", min_m..=1000.0).unwrap_or(6.0),
     };

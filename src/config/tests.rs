@@ -46,11 +46,12 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a good value that differs from the one in force, and a value that is not allowed.
-const KEYS: [(&str, &str, &str); 82] = [
+const KEYS: [(&str, &str, &str); 84] = [
     ("arm.driver", "'franka'", "'frankka'"),
     ("arm.address", "'172.16.0.2'", "7"),
     ("arm.urdf", "'other.urdf'", "7"),
     ("arm.joints", "['j2', 'j1']", "['j1', 'j9']"),
+    ("arm.joint_offsets", "[0.01, -0.02]", "[0.01]"),
     ("arm.base_link", "'b'", "'nowhere'"),
     ("arm.flange_link", "'tool'", "'nowhere'"),
     ("arm.max_speed_rad_s", "0.25", "-1"),
@@ -82,6 +83,7 @@ const KEYS: [(&str, &str, &str); 82] = [
     ("camera.wrist.depth.rectified", "true", "'yes'"),
     ("camera.wrist.depth.camera_from_depth.xyz_m", "[0.01, 0, 0]", "[]"),
     ("camera.wrist.depth.camera_from_depth.quat_xyzw", "[0, 1, 0, 0]", "[2, 0, 0, 0]"),
+    ("camera.wrist.depth.factor", "1.01", "0"),
     ("camera.wrist.depth.min_m", "0.2", "-0.2"),
     ("camera.wrist.depth.max_m", "3", "0.05"),
     ("camera.wrist.sim.noise_sigma", "1", "-1"),

@@ -43,6 +43,7 @@ fn arm(arm: &Arm) -> Table {
         ("address", is(arm.address.as_str())),
         ("urdf", is(drivers::recording::URDF_FILE)),
         ("joints", is(arm.joints.clone())),
+        ("joint_offsets", is(arm.joint_offsets.clone())),
         ("base_link", is(arm.base_link.as_str())),
         ("flange_link", is(arm.flange_link.as_str())),
         ("max_speed_rad_s", is(arm.max_speed_rad_s)),
@@ -84,6 +85,7 @@ fn depth(depth: &Depth) -> Table {
         ("intrinsics", intrinsics(&depth.intrinsics)),
         ("rectified", is(depth.intrinsics.rectified)),
         ("camera_from_depth", pose(&depth.camera_from_depth)),
+        ("factor", is(depth.factor)),
         ("min_m", is(depth.min_m)),
         ("max_m", is(depth.max_m)),
     ])

@@ -105,7 +105,7 @@ mod tests {
             let camera = &rig.cameras[0];
             let acceptance = Acceptance::new(&rig.join, camera, Spacing { translation_m: 1.0, rotation_rad: 1.0 });
             let judge = |twist| {
-                let posed = Posed { world_from_camera: Transform::identity(), twist };
+                let posed = Posed { world_from_camera: Transform::identity(), twist, joint_twists: [].into() };
                 acceptance.judge_speed(&posed, &camera.intrinsics, Some(0.01), 0.5)
             };
             assert_eq!(judge(None), expected);

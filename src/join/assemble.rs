@@ -69,8 +69,9 @@ pub(super) fn depth_map(image: &Image, depth: &config::Depth, lens: &Lens, posed
     expect_size(image, &depth.intrinsics)?;
     let mut depth_m = lens.depth_m(image.decode_depth_m()?)?;
     #[expect(clippy::cast_possible_truncation, reason = "a range in metres needs no more digits")]
-    let (min_m, max_m) = (depth.min_m as f32, depth.max_m as f32);
+    let (factor, min_m, max_m) = (depth.factor as f32, depth.min_m as f32, depth.max_m as f32);
     for depth_m in &mut depth_m {
+        *depth_m *= factor;
         if !(min_m..=max_m).contains(depth_m) {
             *depth_m = 0.0;
         }

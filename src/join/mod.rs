@@ -335,6 +335,7 @@ impl CameraState {
             world_from_camera: ripe.posed.world_from_camera,
             twist: ripe.posed.twist,
             readout_secs: self.acceptance.readout_secs(),
+            joint_twists: ripe.posed.joint_twists,
             split,
             truth,
         })

@@ -5,6 +5,7 @@ use anyhow::Context;
 use drivers::BasePose;
 use kinematics::{Chain, HistoryError, Intrinsics, JointHistory, JointState, PoseHistory, Stamp, Transform, Twist};
 use nalgebra::Vector3;
+use std::sync::Arc;
 use std::time::Duration;
 
 /// Readings kept: 20 s at 1 kHz, more than any image waits.
@@ -15,6 +16,8 @@ pub(super) struct Motion {
     chain: Chain,
     /// Where each joint of the chain stands in the readings.
     order: Vec<usize>,
+    /// What is added to each joint of the chain.
+    offsets: Vec<f64>,
     joints: JointHistory,
     base: BaseMotion,
 }
@@ -26,10 +29,12 @@ enum BaseMotion {
 }
 
 /// A camera's pose and velocity at a stamp.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub(super) struct Posed {
     pub(super) world_from_camera: Transform,
     pub(super) twist: Option<Twist>,
+    /// Of the camera for each joint of the chain that moves by a radian or metre; none where no joint carries the camera.
+    pub(super) joint_twists: Arc<[Twist]>,
 }
 
 impl Motion {
@@ -44,7 +49,8 @@ impl Motion {
                 BaseMotion::Told(PoseHistory::new(max_gap, MAX_READINGS))
             }
         };
-        Ok(Self { chain, order, joints: JointHistory::new(max_gap, MAX_READINGS), base })
+        let offsets = order.iter().map(|ix| rig.arm.joint_offsets.get(*ix).copied().unwrap_or(0.0)).collect();
+        Ok(Self { chain, order, offsets, joints: JointHistory::new(max_gap, MAX_READINGS), base })
     }
 
     /// Takes joint readings in the order of the device; says whether they made sense.
@@ -57,6 +63,7 @@ impl Motion {
         };
         let state = match (ordered(&state.position), ordered(&state.velocity)) {
             (Some(position), Some(velocity)) if !position.is_empty() => {
+                let position = position.iter().zip(&self.offsets).map(|(reading, offset)| reading + offset).collect();
                 JointState { stamp: state.stamp, position, velocity, effort: Vec::new() }
             }
             _ => return false,
@@ -79,7 +86,8 @@ impl Motion {
             BaseMotion::Told(history) if camera.parent != Parent::World => history.at(stamp)?,
             BaseMotion::Told(_) => Transform::identity(),
         };
-        let still = |world_from_camera| Posed { world_from_camera, twist: Some(Twist::zero()) };
+        let still =
+            |world_from_camera| Posed { world_from_camera, twist: Some(Twist::zero()), joint_twists: [].into() };
         match camera.parent {
             Parent::World => Ok(still(camera.parent_from_camera)),
             Parent::Base => Ok(still(world_from_base * camera.parent_from_camera)),
@@ -90,9 +98,11 @@ impl Motion {
                     return Err(HistoryError::NotFinite);
                 };
                 let flange_twist = self.chain.tip_twist(&joints.position, &joints.velocity).ok();
+                let by_joint = self.chain.tip_twists_by_joint(&joints.position).unwrap_or_default();
                 Ok(Posed {
                     world_from_camera: world_from_base * base_from_flange * camera.parent_from_camera,
                     twist: flange_twist.map(|twist| twist.of_attached(&camera.parent_from_camera)),
+                    joint_twists: by_joint.iter().map(|twist| twist.of_attached(&camera.parent_from_camera)).collect(),
                 })
             }
         }

@@ -114,6 +114,7 @@ mod tests {
             world_from_camera: Transform::new(Vector3::new(x_m, 0.0, 0.0), Vector3::zeros()),
             twist: None,
             readout_secs: 0.0,
+            joint_twists: [].into(),
             split: Split::of(ix),
             truth: None,
         })

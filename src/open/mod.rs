@@ -56,6 +56,11 @@ pub(crate) fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -
     };
     if let Some(recorded) = recording.joint_names() {
         chain_of(&rig)?.order_in(recorded).with_context(|| format!("the recording {path:?} does not fit the robot"))?;
+        if !rig.arm.joint_offsets.is_empty() {
+            let of = |name: &String| rig.arm.joints.iter().position(|known| known == name);
+            let offset = |name: &String| of(name).map_or(0.0, |ix| rig.arm.joint_offsets[ix]);
+            rig.arm.joint_offsets = recorded.iter().map(offset).collect();
+        }
         rig.arm.joints = recorded.to_vec();
     }
     let damage = Arc::default();

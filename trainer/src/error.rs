@@ -6,6 +6,9 @@ use std::path::PathBuf;
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
+    /// Our own bug: the thread that aligned keyframes ended early.
+    #[error("the alignment of keyframes did not end")]
+    AlignmentPanicked,
     /// No GPU, real or software, answers.
     #[error("no GPU adapter found: install a Vulkan driver (software: the package mesa-vulkan-drivers)")]
     NoAdapter,

@@ -48,6 +48,8 @@ pub struct Keyframe {
     pub twist: Option<Twist>,
     /// Time from the first row's exposure to the last row's, seconds; 0 for a global shutter.
     pub readout_secs: f64,
+    /// How the camera moves, in its own axes, when one of the joints that carry it moves by a radian or metre; empty where unknown.
+    pub joint_twists: Arc<[Twist]>,
     /// What it may be used for.
     pub split: Split,
     /// What a simulator knows.

@@ -1,5 +1,6 @@
 //! Radiance fields trained on wgpu: keyframes in, pictures out.
 
+pub mod align;
 pub mod checkpoint;
 mod error;
 pub mod eval;

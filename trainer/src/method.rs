@@ -1,5 +1,6 @@
 //! What every scene model can do.
 
+use crate::align::Alignment;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::PassTiming;
 use crate::splat::PosedLens;
@@ -62,6 +63,8 @@ pub trait Method {
     fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error>;
     /// Takes one step with a timestamp around every pass; empty where the adapter has none.
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error>;
+    /// What alignment of the keyframes found, once that is settled; none where it was not asked for or could not be done.
+    fn alignment(&self) -> Option<&Alignment>;
     /// Where training stands.
     fn progress(&self) -> Progress;
     /// What the parts of the model that were tried bought, in the order of the trials.

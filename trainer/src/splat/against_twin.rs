@@ -258,7 +258,8 @@ fn check_gradients(
     view_passes.compare(&mut passes, &bench.learn, &wanted.target());
     view_passes.backward(&mut passes, &bench.learn);
     view_passes.update(&mut passes, &gradients_only, &rule, true);
-    let all = TermSet { mount: true, delay: true, lens: true, image_poses: true, image_gains: true };
+    let all =
+        TermSet { mount: true, delay: true, lens: true, image_poses: true, image_gains: true, ..TermSet::default() };
     let mut cameras = CameraTerms::new(gpu, all).unwrap();
     let lens = cameras.lens(gpu, &moving_keyframe()).unwrap();
     let refine = LearnPipelines::camera_gradients_only(gpu).unwrap();
@@ -348,6 +349,7 @@ fn moving_keyframe() -> Keyframe {
             angular_rad_s: Vector3::new(-0.5, 0.75, 1.0),
         }),
         readout_secs: 0.0,
+        joint_twists: [].into(),
         split: Split::Train,
         truth: None,
     }

@@ -8,14 +8,15 @@ use super::params::{CameraRule, Lens, N_TERMS};
 use super::passes::ViewPasses;
 use crate::checkpoint::Checkpoint;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline, f32_of, f32s_of};
-use crate::{Error, Keyframe};
-use kinematics::{Stamp, Transform, Twist};
+use crate::{DepthMap, Error, Keyframe, Shutter};
+use kinematics::{Stamp, Transform, Twist, transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// Which terms are learned.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(default)]
 pub struct TermSet {
     /// How each camera is mounted: rotation and translation between camera and what carries it (hand-eye).
     pub mount: bool,
@@ -27,12 +28,36 @@ pub struct TermSet {
     pub image_poses: bool,
     /// Gains of red, green and blue of each image.
     pub image_gains: bool,
+    /// What is added to the reading of each joint that carries a camera. Like the following, by alignment only.
+    pub joints: bool,
+    /// Where the depth frame sits in the camera's.
+    pub depth_pose: bool,
+    /// Factor on the readings of depth.
+    pub depth_scale: bool,
+    /// Time from the first row's exposure to the last row's.
+    pub readout: bool,
 }
 
 impl TermSet {
     /// Whether anything is learned.
     pub fn any(self) -> bool {
         self != Self::default()
+    }
+
+    /// All of both.
+    #[must_use]
+    pub fn and(self, other: Self) -> Self {
+        Self {
+            mount: self.mount || other.mount,
+            delay: self.delay || other.delay,
+            lens: self.lens || other.lens,
+            image_poses: self.image_poses || other.image_poses,
+            image_gains: self.image_gains || other.image_gains,
+            joints: self.joints || other.joints,
+            depth_pose: self.depth_pose || other.depth_pose,
+            depth_scale: self.depth_scale || other.depth_scale,
+            readout: self.readout || other.readout,
+        }
     }
 
     fn of_camera(self) -> u32 {
@@ -54,6 +79,10 @@ impl std::fmt::Display for TermSet {
             (self.lens, "lenses"),
             (self.image_poses, "poses of images"),
             (self.image_gains, "gains of images"),
+            (self.joints, "joint offsets"),
+            (self.depth_pose, "poses of depth"),
+            (self.depth_scale, "scales of depth"),
+            (self.readout, "readout times"),
         ];
         let names: Vec<&str> = names.into_iter().filter(|(on, _)| *on).map(|(_, name)| name).collect();
         f.write_str(&if names.is_empty() { "nothing".to_owned() } else { names.join(", ") })
@@ -62,6 +91,7 @@ impl std::fmt::Display for TermSet {
 
 /// What was learned about one camera.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default)]
 pub struct CameraFix {
     /// Rotation vector in the camera's own axes, radians: `camera_from_world` becomes turn and shift after it.
     pub turn_rad: [f64; 3],
@@ -73,6 +103,16 @@ pub struct CameraFix {
     pub log_focal: [f64; 2],
     /// Shift of the principal point, in focal lengths.
     pub principal_focals: [f64; 2],
+    /// What is added to the readings of the joints that carry the camera, radians or metres; empty where nothing is.
+    pub joint_offsets: Vec<f64>,
+    /// Rotation vector in the camera's own axes, radians: `color_from_depth` becomes turn and shift after it.
+    pub depth_turn_rad: [f64; 3],
+    /// Metres, in the camera's axes.
+    pub depth_shift_m: [f64; 3],
+    /// Logarithm of the factor on depth.
+    pub log_depth_scale: f64,
+    /// What is added to the readout time, seconds.
+    pub readout_secs: f64,
     /// Turn and shift of the images learned from, by stamp in nanoseconds: between two of them poses drift evenly.
     pub drift: BTreeMap<i64, [f64; 6]>,
 }
@@ -86,6 +126,8 @@ pub struct PosedLens {
     pub focal_px: [f64; 2],
     /// Principal point, pixels.
     pub principal_px: [f64; 2],
+    /// How it moves while its rows are read, where known.
+    pub shutter: Option<Shutter>,
 }
 
 impl PosedLens {
@@ -95,6 +137,7 @@ impl PosedLens {
             world_from_camera: keyframe.world_from_camera,
             focal_px: keyframe.focal_px,
             principal_px: keyframe.principal_px,
+            shutter: keyframe.twist.map(|twist| Shutter { twist, readout_secs: keyframe.readout_secs }),
         }
     }
 }
@@ -116,24 +159,93 @@ impl CameraFix {
 
     /// The camera of a keyframe as it is, where the input has it as [`PosedLens::of`].
     pub fn apply(&self, keyframe: &Keyframe) -> PosedLens {
-        let (lens, twist) = (PosedLens::of(keyframe), keyframe.twist);
-        let moved = |turn: Vector3<f64>, shift: Vector3<f64>| {
-            Transform::from_parts(Translation3::from(shift), UnitQuaternion::from_scaled_axis(turn))
-        };
-        let delay = twist.map_or(Transform::identity(), |twist| {
-            moved(-self.delay_secs * twist.angular_rad_s, -self.delay_secs * twist.linear_m_s)
-        });
+        let lens = PosedLens::of(keyframe);
+        let delay = self.delayed_from_given(keyframe);
+        let mut by_joints = Twist::zero();
+        for (twist, offset) in keyframe.joint_twists.iter().zip(&self.joint_offsets) {
+            by_joints.linear_m_s += twist.linear_m_s * *offset;
+            by_joints.angular_rad_s += twist.angular_rad_s * *offset;
+        }
+        let joints = transform::exp(&by_joints, -1.0);
         let mount = moved(self.turn_rad.into(), self.shift_m.into());
         let [turn_x, turn_y, turn_z, x, y, z] = self.drift_at(keyframe.stamp);
         let drift = moved(Vector3::new(turn_x, turn_y, turn_z), Vector3::new(x, y, z));
+        let world_from_camera = (mount * drift * joints * delay * lens.world_from_camera.inverse()).inverse();
+        let raw_from_corrected = lens.world_from_camera.inverse() * world_from_camera;
+        let shutter = |shutter: Shutter| Shutter {
+            twist: shutter.twist.of_attached(&raw_from_corrected),
+            readout_secs: (shutter.readout_secs + self.readout_secs).max(0.0),
+        };
         PosedLens {
-            world_from_camera: (mount * drift * delay * lens.world_from_camera.inverse()).inverse(),
+            world_from_camera,
+            shutter: lens.shutter.map(shutter),
             focal_px: std::array::from_fn(|axis| lens.focal_px[axis] * self.log_focal[axis].exp()),
             principal_px: std::array::from_fn(|axis| {
                 lens.principal_px[axis] + self.principal_focals[axis] * lens.focal_px[axis]
             }),
         }
     }
+
+    /// From the camera as the input has it to the camera at the time the image was taken.
+    pub(crate) fn delayed_from_given(&self, keyframe: &Keyframe) -> Transform {
+        keyframe.twist.map_or(Transform::identity(), |twist| {
+            moved(-self.delay_secs * twist.angular_rad_s, -self.delay_secs * twist.linear_m_s)
+        })
+    }
+
+    /// Where the depth frame of a keyframe is in its color frame.
+    pub fn color_from_depth(&self, keyframe: &Keyframe, depth: &DepthMap) -> Transform {
+        let moved = moved(self.depth_turn_rad.into(), self.depth_shift_m.into());
+        moved * keyframe.world_from_camera.inverse() * depth.world_from_camera
+    }
+
+    /// The keyframe as it would be had the input been right.
+    pub fn corrected(&self, keyframe: &Keyframe) -> Keyframe {
+        let PosedLens { world_from_camera, focal_px, principal_px, .. } = self.apply(keyframe);
+        let depth = keyframe.depth.as_ref().map(|depth| {
+            let same_lens = shares_lens(keyframe, depth);
+            let focal = |axis: usize| depth.focal_px[axis] * self.log_focal[axis].exp();
+            let principal = |axis: usize| depth.principal_px[axis] + self.principal_focals[axis] * depth.focal_px[axis];
+            let factor = f32_of(self.log_depth_scale.exp());
+            DepthMap {
+                size_px: depth.size_px,
+                focal_px: if same_lens { [0, 1].map(focal) } else { depth.focal_px },
+                principal_px: if same_lens { [0, 1].map(principal) } else { depth.principal_px },
+                depth_m: match factor {
+                    1.0 => depth.depth_m.clone(),
+                    factor => depth.depth_m.iter().map(|z| z * factor).collect(),
+                },
+                world_from_camera: world_from_camera * self.color_from_depth(keyframe, depth),
+            }
+        });
+        let raw_from_corrected = keyframe.world_from_camera.inverse() * world_from_camera;
+        Keyframe {
+            focal_px,
+            principal_px,
+            depth,
+            world_from_camera,
+            twist: keyframe.twist.map(|twist| twist.of_attached(&raw_from_corrected)),
+            readout_secs: (keyframe.readout_secs + self.readout_secs).max(0.0),
+            joint_twists: keyframe.joint_twists.iter().map(|twist| twist.of_attached(&raw_from_corrected)).collect(),
+            ..keyframe.clone()
+        }
+    }
+}
+
+/// Turn, then shift.
+pub(crate) fn moved(turn_rad: Vector3<f64>, shift_m: Vector3<f64>) -> Transform {
+    Transform::from_parts(Translation3::from(shift_m), UnitQuaternion::from_scaled_axis(turn_rad))
+}
+
+/// Whether depth was registered to the color image, or comes through the same lens: what is wrong with that is wrong with both.
+pub(crate) fn shares_lens(keyframe: &Keyframe, depth: &DepthMap) -> bool {
+    const SAME_FRAC: f64 = 1e-4; // Sizes are rounded to pixels.
+    [0, 1].into_iter().all(|axis| {
+        let share = f64::from(depth.size_px[axis]) / f64::from(keyframe.size_px[axis]);
+        let off_px = (depth.focal_px[axis] - share * keyframe.focal_px[axis]).abs()
+            + (depth.principal_px[axis] - share * keyframe.principal_px[axis]).abs();
+        off_px <= SAME_FRAC * depth.focal_px[axis]
+    })
 }
 
 /// Rate of rotations at the start, radians a step; the others follow from it.
@@ -181,13 +293,7 @@ impl CameraTerms {
 
     /// Learns more.
     pub(crate) fn learn_also(&mut self, more: TermSet) {
-        self.set = TermSet {
-            mount: self.set.mount || more.mount,
-            delay: self.set.delay || more.delay,
-            lens: self.set.lens || more.lens,
-            image_poses: self.set.image_poses || more.image_poses,
-            image_gains: self.set.image_gains || more.image_gains,
-        };
+        self.set = self.set.and(more);
     }
 
     /// The lens of a keyframe, with slots for its camera's terms and its own.
@@ -370,6 +476,7 @@ impl CameraTerms {
                 } else {
                     BTreeMap::new()
                 },
+                ..CameraFix::default()
             }
         };
         Ok(self.cameras.iter().map(|(name, slots)| (name.to_string(), fix(slots))).collect())

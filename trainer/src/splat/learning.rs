@@ -85,6 +85,7 @@ pub(super) fn n_keyframes(gpu: &Arc<Gpu>, n: usize, with_depth: bool) -> Vec<Arc
                 world_from_camera,
                 twist: None,
                 readout_secs: 0.0,
+                joint_twists: [].into(),
                 split: Split::of(ix),
                 truth: None,
             })

@@ -2,6 +2,8 @@
 
 #[cfg(test)]
 mod against_twin;
+#[cfg(test)]
+mod aligned;
 pub mod arrays;
 pub mod bench;
 mod buffers;
@@ -25,6 +27,7 @@ mod trials;
 mod views;
 
 pub use camera_terms::{CameraFix, PosedLens, TermSet};
+pub(crate) use camera_terms::{moved, shares_lens};
 pub use options::SplatOptions;
 pub use trainer::SplatTrainer;
 pub use trials::{CameraChoice, Candidate, CountChoice, Trial};

@@ -28,6 +28,9 @@ pub struct SplatOptions {
     pub coarse_steps: Option<[u64; 2]>,
     /// What is learned about cameras.
     pub cameras: CameraChoice,
+    /// What is found about cameras by laying keyframes with depth over each other, before it is learned from the splats.
+    #[serde(default)]
+    pub align: CameraChoice,
     /// Splats that one depth image may add; `None`: fewer on a processor.
     pub seeds_per_image: Option<f64>,
 }
@@ -45,6 +48,7 @@ impl Default for SplatOptions {
             depth_per_m: 0.1,
             coarse_steps: None,
             cameras: CameraChoice::default(),
+            align: CameraChoice::default(),
             seeds_per_image: None,
         }
     }

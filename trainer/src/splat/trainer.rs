@@ -1,6 +1,7 @@
 //! The splat model as a [`Method`]: seeds, steps, growth, pictures.
 #![expect(clippy::cast_possible_truncation, reason = "counts derived from caps that are u32, and bits of a seed")]
 
+mod aligning;
 mod checkpoint;
 mod size;
 
@@ -14,9 +15,11 @@ use super::passes::{self, GrowthBuffers, Target, ViewPasses};
 use super::seed::{self, Density, Seeder};
 use super::trials::{CameraChoice, Candidate, Due, HeldBack, Now, Trial, Trials};
 use super::views::{LevelImages, TrainView};
+use crate::align::Alignment;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
 use crate::{Error, Keyframe, Method, Part, Picture, Progress, Projection, RenderRequest, Split, ply};
+use aligning::Aligning;
 use kinematics::Stamp;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
@@ -75,6 +78,7 @@ pub struct SplatTrainer {
     cameras: CameraTerms,
     /// Of the saved model this one came from.
     loaded_fixes: BTreeMap<String, CameraFix>,
+    aligning: Aligning,
     trials: Trials,
     passes: Passes,
     seeder: Seeder,
@@ -186,6 +190,7 @@ impl SplatTrainer {
                 },
             )?,
             loaded_fixes: BTreeMap::new(),
+            aligning: Aligning::new(&options.align),
             trials: Trials::new(&options.cameras, options.count),
             passes: Passes::default(),
             seeder: Seeder::default(),
@@ -222,7 +227,9 @@ impl SplatTrainer {
 
     /// Knows about cameras what a saved model did, see `model.json`.
     pub fn with_fixes(mut self, folder: &Path) -> Result<Self, Error> {
-        self.loaded_fixes = read_fixes(&folder.join("model.json"))?;
+        let about = read_about(&folder.join("model.json"))?;
+        self.loaded_fixes = about.cameras;
+        self.aligning = Aligning::Done(about.alignment);
         Ok(self)
     }
 
@@ -644,7 +651,7 @@ impl SplatTrainer {
                 }
                 Due::Join => {
                     for keyframe in self.trials.settle() {
-                        self.push(keyframe)?;
+                        self.learn_from(keyframe)?;
                     }
                     self.begin_learning()?;
                 }
@@ -665,6 +672,16 @@ impl SplatTrainer {
             Candidate::ShDegree { to, .. } => self.lower_degree(to)?,
         }
         self.begin_learning()
+    }
+
+    fn learn_from(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
+        self.settle()?;
+        self.has_depth |= keyframe.depth.is_some();
+        // What comes late finds at least half of the plan ahead of it: rates that still move things, and growth.
+        self.schedule_start = self.schedule_start.max(self.step.saturating_sub(self.options.n_planned_steps / 2));
+        self.pending.push(keyframe.clone());
+        self.views.push(TrainView::new(keyframe));
+        Ok(())
     }
 
     /// How the trials of what the model needs ended so far.
@@ -719,16 +736,12 @@ impl Method for SplatTrainer {
         if keyframe.split == Split::Test {
             return Ok(());
         }
+        let keyframe = self.aligning.corrected(&keyframe);
         if keyframe.split == Split::Selection && self.trials.hold_back() {
             self.trials.held_back.push(HeldBack { keyframe, image: None });
             return Ok(());
         }
-        self.has_depth |= keyframe.depth.is_some();
-        // What comes late finds at least half of the plan ahead of it: rates that still move things, and growth.
-        self.schedule_start = self.schedule_start.max(self.step.saturating_sub(self.options.n_planned_steps / 2));
-        self.pending.push(keyframe.clone());
-        self.views.push(TrainView::new(keyframe));
-        Ok(())
+        self.learn_from(keyframe)
     }
 
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
@@ -748,12 +761,17 @@ impl Method for SplatTrainer {
             return Ok(0);
         }
         let learn = self.learn()?;
+        self.align_when_due()?;
         self.try_when_due()?;
         self.grow_when_due(&learn)?;
         let by_time = if self.step_millis > 0.0 { (SUBMIT_MILLIS / self.step_millis) as u64 } else { 1 };
         let to_change = GROWTH_PERIOD - self.step % GROWTH_PERIOD; // Growth and degrees change at multiples of it.
         let asked = n;
-        let n = n.min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT)).min(to_change).min(self.trials.steps_left(self.step));
+        let n = n
+            .min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT))
+            .min(to_change)
+            .min(self.trials.steps_left(self.step))
+            .min(self.steps_to_alignment());
         self.splats.set_active_degree(&self.gpu, u32::try_from(self.step / SH_PERIOD).unwrap_or(3).min(3));
         self.write_rule();
         let since = Instant::now();
@@ -822,7 +840,12 @@ impl Method for SplatTrainer {
     }
 
     fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {
-        Ok(fixed(&self.camera_fixes()?, keyframe))
+        let learned = self.camera_fixes()?;
+        Ok(self.aligning.posed_lens(keyframe, learned.get(keyframe.camera.as_ref())))
+    }
+
+    fn alignment(&self) -> Option<&Alignment> {
+        self.aligning.result()
     }
 
     fn progress(&self) -> Progress {
@@ -854,6 +877,7 @@ impl Method for SplatTrainer {
             "sh_degree": arrays.sh_degree,
             "seed": self.options.seed,
             "trials": self.report(),
+            "alignment": self.aligning.result(),
             "cameras": self.camera_fixes()?,
         });
         let path = folder.join("model.json");
@@ -870,20 +894,20 @@ fn fixed(fixes: &BTreeMap<String, CameraFix>, keyframe: &Keyframe) -> PosedLens 
     fixes.get(keyframe.camera.as_ref()).map_or_else(|| PosedLens::of(keyframe), |fix| fix.apply(keyframe))
 }
 
+/// What a saved model knows about cameras.
+#[derive(Default, serde::Deserialize)]
+#[serde(default)]
+struct About {
+    cameras: BTreeMap<String, CameraFix>,
+    alignment: Option<Alignment>,
+}
+
 /// What a saved model knows about cameras; a model without such a file, or of an earlier version, knows nothing.
-fn read_fixes(path: &Path) -> Result<BTreeMap<String, CameraFix>, Error> {
-    #[derive(serde::Deserialize)]
-    struct About {
-        #[serde(default)]
-        cameras: BTreeMap<String, CameraFix>,
-    }
+fn read_about(path: &Path) -> Result<About, Error> {
     let refused = |reason: String| Error::SplatFile { path: path.to_owned(), reason };
     match std::fs::read(path) {
-        Ok(bytes) => {
-            let about: About = serde_json::from_slice(&bytes).map_err(|error| refused(error.to_string()))?;
-            Ok(about.cameras)
-        }
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(BTreeMap::new()),
+        Ok(bytes) => serde_json::from_slice(&bytes).map_err(|error| refused(error.to_string())),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(About::default()),
         Err(error) => Err(refused(error.to_string())),
     }
 }

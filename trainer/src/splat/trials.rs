@@ -404,17 +404,20 @@ impl Trials {
 mod tests {
     use super::*;
 
-    const POSES: TermSet = TermSet { mount: false, delay: false, lens: false, image_poses: true, image_gains: false };
     const HALVED: Candidate = Candidate::Halved { from: 20_000, to: 10_000 };
+
+    fn poses() -> TermSet {
+        TermSet { image_poses: true, ..TermSet::default() }
+    }
 
     #[test]
     fn a_gain_counts_when_it_is_larger_than_its_scatter() {
-        let trial = |with: &[f64]| Trial::of(Candidate::Cameras(POSES), &[20.0, 22.0, 24.0, 21.0], with);
+        let trial = |with: &[f64]| Trial::of(Candidate::Cameras(poses()), &[20.0, 22.0, 24.0, 21.0], with);
         assert!(trial(&[20.5, 22.4, 24.6, 21.5]).kept);
         assert!(!trial(&[20.03, 22.04, 24.02, 21.03]).kept, "too small, if sure");
         assert!(!trial(&[23.0, 20.5, 25.5, 19.5]).kept, "large, but not sure");
         assert!(!trial(&[19.0, 21.0, 23.0, 20.0]).kept);
-        assert!(!Trial::of(Candidate::Cameras(POSES), &[20.0], &[25.0]).kept, "one image shows no scatter");
+        assert!(!Trial::of(Candidate::Cameras(poses()), &[20.0], &[25.0]).kept, "one image shows no scatter");
         let gain = trial(&[20.5, 22.5, 24.5, 21.5]);
         assert!((gain.gain_db - 0.5).abs() < 1e-12 && gain.standard_error_db < 1e-12);
     }
@@ -441,7 +444,7 @@ mod tests {
     #[test]
     fn too_few_images_join_in_time() {
         for count in [CountChoice::ToCap, CountChoice::Tested] {
-            let trials = Trials::new(&CameraChoice::Try(vec![POSES]), count);
+            let trials = Trials::new(&CameraChoice::Try(vec![poses()]), count);
             assert!(trials.hold_back());
             let due = |step| trials.due(Now { step, n_splats: 5000, is_mature: false, sh_degree: 3 });
             assert_eq!(due(TRIAL_START), Due::Nothing);

@@ -4,10 +4,10 @@
     reason = "pixels are rounded down on purpose, within image sizes that are u32"
 )]
 
-use super::camera_terms::CameraTerms;
+use super::camera_terms::{CameraTerms, PosedLens};
 use super::params::{Camera, LOW_PASS_PX2, TILE_PX};
 use crate::gpu::{Buffer, Gpu, f32_of};
-use crate::{Error, Keyframe, Shutter};
+use crate::{Error, Keyframe};
 use nalgebra::Point3;
 use std::sync::Arc;
 
@@ -123,7 +123,7 @@ pub(crate) fn camera_of(keyframe: &Keyframe) -> Camera {
         size_px: keyframe.size_px,
         focal_px: keyframe.focal_px,
         principal_px: keyframe.principal_px,
-        shutter: keyframe.twist.map(|twist| Shutter { twist, readout_secs: keyframe.readout_secs }),
+        shutter: PosedLens::of(keyframe).shutter,
         near_m: NEAR_M,
         far_m: FAR_M,
         crop: None,

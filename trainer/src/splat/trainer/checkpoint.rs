@@ -1,6 +1,8 @@
 //! The state of a splat model in training: all that decides how it goes on, bit for bit.
 
 use super::SplatTrainer;
+use super::aligning::Aligning;
+use crate::align::Alignment;
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::gpu::{Gpu, PendingRead};
 use crate::splat::buffers::{N_PLANED, SplatBuffers};
@@ -50,6 +52,9 @@ struct State {
     terms: TermSet,
     untried: Untried,
     tried: Vec<Trial>,
+    /// Whether alignment is settled, and what it found; views are told as it corrected them.
+    is_aligned: bool,
+    alignment: Option<Alignment>,
 }
 
 /// What tells one keyframe from another without its pixels.
@@ -136,6 +141,8 @@ impl SplatTrainer {
             terms,
             untried: self.trials.untried(),
             tried: self.trials.ended.clone(),
+            is_aligned: self.aligning.is_done(),
+            alignment: self.aligning.result().cloned(),
         };
         let state =
             serde_json::to_value(state).map_err(|error| Error::CheckpointState { reason: error.to_string() })?;
@@ -174,7 +181,12 @@ impl SplatTrainer {
         }
         let state: State =
             serde_json::from_value(checkpoint.state.clone()).map_err(|error| bad_state(error.to_string()))?;
-        let (views, rest) = matched(&state, keyframes)?;
+        let aligning = if state.is_aligned {
+            Aligning::Done(state.alignment.clone())
+        } else {
+            Aligning::new(&state.options.align)
+        };
+        let (views, rest) = matched(&state, &aligning, keyframes)?;
         let n_splats = state.n_splats;
         if n_splats > state.capacity || state.active_degree > state.sh_degree || state.sh_degree > 3 {
             return Err(bad_state(format!("{n_splats} splats of degree {} do not fit", state.active_degree)));
@@ -205,6 +217,7 @@ impl SplatTrainer {
         trainer.cameras.restore(&trainer.gpu, &state.slots, state.terms, checkpoint)?;
         trainer.trials.restore(state.untried, state.tried);
         trainer.views = views.into_iter().map(TrainView::new).collect();
+        trainer.aligning = aligning;
         trainer.unseeded = unseeded;
         trainer.scene_size_m = state.scene_size_m;
         trainer.has_depth = state.has_depth;
@@ -219,24 +232,27 @@ impl SplatTrainer {
 /// The keyframes of the views, in their order, and the others.
 type Matched = (Vec<Arc<Keyframe>>, Vec<Arc<Keyframe>>);
 
-fn matched(state: &State, keyframes: &[Arc<Keyframe>]) -> Result<Matched, Error> {
+fn matched(state: &State, aligning: &Aligning, keyframes: &[Arc<Keyframe>]) -> Result<Matched, Error> {
     let by_name: HashMap<_, _> = keyframes
         .iter()
         .filter(|keyframe| keyframe.split != Split::Test)
         .map(|keyframe| ((&*keyframe.camera, keyframe.stamp.0), keyframe))
         .collect();
     let mut views = Vec::new();
+    let mut as_given: Vec<&Arc<Keyframe>> = Vec::new();
     for seen in &state.views {
         let (camera, stamp) = (seen.camera.as_str(), seen.stamp_nanos);
         let keyframe = by_name.get(&(camera, stamp)).ok_or_else(|| {
             Error::CheckpointData(format!("image {stamp} of camera {camera:?} is not there to be learned from"))
         })?;
-        if let Some(difference) = seen.difference(keyframe) {
+        let corrected = aligning.corrected(keyframe);
+        if let Some(difference) = seen.difference(&corrected) {
             return Err(Error::CheckpointData(difference));
         }
-        views.push(Arc::clone(keyframe));
+        as_given.push(*keyframe);
+        views.push(corrected);
     }
-    let is_view = |keyframe: &Arc<Keyframe>| views.iter().any(|view| Arc::ptr_eq(view, keyframe));
+    let is_view = |keyframe: &Arc<Keyframe>| as_given.iter().any(|view| Arc::ptr_eq(view, keyframe));
     let rest = keyframes.iter().filter(|keyframe| !is_view(keyframe)).cloned().collect();
     Ok((views, rest))
 }

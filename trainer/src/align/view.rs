@@ -1,0 +1,141 @@
+//! A frame's cameras as the corrections at hand have them, and how they move with each term.
+
+use super::frame::Frame;
+use super::layout::Layout;
+use crate::splat::CameraFix;
+use kinematics::{Transform, Twist};
+use nalgebra::{Matrix3, Vector3};
+
+/// A rigid motion as a matrix: faster on many points.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Motion {
+    pub(super) rotation: Matrix3<f64>,
+    pub(super) shift: Vector3<f64>,
+}
+
+impl Motion {
+    fn of(transform: &Transform) -> Self {
+        Self { rotation: transform.rotation.to_rotation_matrix().into_inner(), shift: transform.translation.vector }
+    }
+
+    pub(super) fn then(&self, point: &Vector3<f64>) -> Vector3<f64> {
+        self.rotation * point + self.shift
+    }
+
+    pub(super) fn back(&self, point: &Vector3<f64>) -> Vector3<f64> {
+        self.rotation.tr_mul(&(point - self.shift))
+    }
+}
+
+/// A frame under the corrections at hand.
+#[derive(Debug)]
+pub(super) struct View {
+    pub(super) world_from_camera: Motion,
+    pub(super) color_from_depth: Motion,
+    pub(super) focal_px: [f64; 2],
+    pub(super) principal_px: [f64; 2],
+    /// As the keyframe has it: what the terms of the lens are shares of.
+    pub(super) raw_focal_px: [f64; 2],
+    pub(super) height_px: f64,
+    pub(super) twist: Twist,
+    pub(super) readout_secs: f64,
+    pub(super) depth_focal_px: [f64; 2],
+    pub(super) depth_principal_px: [f64; 2],
+    pub(super) depth_factor: f64,
+    /// How the camera moves, in its own axes, with a term: index, metres and radians.
+    pub(super) columns: Vec<(usize, Vector3<f64>, Vector3<f64>)>,
+    pub(super) depth_pose: Option<usize>,
+    pub(super) lens: Option<usize>,
+    pub(super) depth_scale: Option<usize>,
+    pub(super) readout: Option<usize>,
+    pub(super) shares_lens: bool,
+}
+
+impl View {
+    pub(super) fn new(frame: &Frame, fix: &CameraFix, layout: &Layout) -> Option<Self> {
+        let keyframe = frame.keyframe.as_ref();
+        let depth = keyframe.depth.as_ref()?;
+        let posed = fix.apply(keyframe);
+        let raw_from_corrected = keyframe.world_from_camera.inverse() * posed.world_from_camera;
+        let terms = layout.of_camera(frame.camera);
+        let mut columns = Vec::new();
+        if let Some(mount) = terms.mount {
+            let unit = |axis: usize| Vector3::from_fn(|row, _| if row == axis { 1.0 } else { 0.0 });
+            columns.extend((0..3).map(|axis| (mount + axis, unit(axis), Vector3::zeros())));
+            columns.extend((0..3).map(|axis| (mount + 3 + axis, Vector3::zeros(), unit(axis))));
+        }
+        let mut moves = |term: usize, twist: &Twist, place: &Transform| {
+            let twist = twist.of_attached(place);
+            columns.push((term, twist.linear_m_s, twist.angular_rad_s));
+        };
+        if let (Some(delay), Some(twist)) = (terms.delay, &keyframe.twist) {
+            moves(delay, twist, &raw_from_corrected);
+        }
+        if let Some(joints) = layout.joints() {
+            let delayed_from_corrected = fix.delayed_from_given(keyframe) * raw_from_corrected;
+            for (joint, twist) in keyframe.joint_twists.iter().enumerate() {
+                moves(joints + joint, twist, &delayed_from_corrected);
+            }
+        }
+        let share = |values: [f64; 2], change: &dyn Fn(usize, f64) -> f64| {
+            if frame.shares_lens { [change(0, values[0]), change(1, values[1])] } else { values }
+        };
+        Some(Self {
+            world_from_camera: Motion::of(&posed.world_from_camera),
+            color_from_depth: Motion::of(&fix.color_from_depth(keyframe, depth)),
+            focal_px: posed.focal_px,
+            principal_px: posed.principal_px,
+            raw_focal_px: keyframe.focal_px,
+            height_px: f64::from(keyframe.size_px[1]),
+            twist: keyframe.twist.map_or(Twist::zero(), |twist| twist.of_attached(&raw_from_corrected)),
+            readout_secs: (keyframe.readout_secs + fix.readout_secs).max(0.0),
+            depth_focal_px: share(depth.focal_px, &|axis, focal| focal * fix.log_focal[axis].exp()),
+            depth_principal_px: share(depth.principal_px, &|axis, principal| {
+                principal + fix.principal_focals[axis] * depth.focal_px[axis]
+            }),
+            depth_factor: fix.log_depth_scale.exp(),
+            columns,
+            depth_pose: terms.depth_pose,
+            lens: terms.lens,
+            depth_scale: terms.depth_scale,
+            readout: terms.readout,
+            shares_lens: frame.shares_lens,
+        })
+    }
+
+    /// Indices of all terms that move it, ascending.
+    pub(super) fn terms(&self) -> Vec<usize> {
+        let mut terms: Vec<usize> = self.columns.iter().map(|(term, _, _)| *term).collect();
+        let range = |begin: Option<usize>, n: usize| begin.into_iter().flat_map(move |begin| begin..begin + n);
+        terms.extend(range(self.depth_pose, 6));
+        terms.extend(range(self.lens, 4));
+        terms.extend(range(self.depth_scale, 1));
+        terms.extend(range(self.readout, 1));
+        terms.sort_unstable();
+        terms
+    }
+
+    /// Where a point at rest in the camera's mid-exposure frame is when its row is read: it, and the share of the readout.
+    pub(super) fn when_read(&self, still: &Vector3<f64>) -> (Vector3<f64>, f64) {
+        if self.readout_secs == 0.0 {
+            return (*still, 0.0);
+        }
+        let drift = -self.readout_secs * self.twist.apparent_velocity(still);
+        let mut at = *still;
+        let mut share = 0.0;
+        for _ in 0..2 {
+            let row = self.focal_px[1] * at.y / at.z + self.principal_px[1];
+            share = (row / self.height_px).clamp(0.0, 1.0) - 0.5;
+            at = still - drift * share;
+        }
+        (at, share)
+    }
+
+    pub(super) fn pixel(&self, point: &Vector3<f64>) -> [f64; 2] {
+        [0, 1].map(|axis| self.focal_px[axis] * point[axis] / point.z + self.principal_px[axis])
+    }
+
+    pub(super) fn depth_pixel(&self, point: &Vector3<f64>) -> [f64; 2] {
+        [0, 1].map(|axis| self.depth_focal_px[axis] * point[axis] / point.z + self.depth_principal_px[axis])
+    }
+}
