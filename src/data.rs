@@ -75,7 +75,13 @@ impl Data {
     ) -> anyhow::Result<Self> {
         let list = args.keyframes.as_deref().map(KeyframeList::load).transpose()?;
         let holdout = args.holdout.as_deref().map(Holdout::from_argument).transpose()?;
-        Self::selected(path, Selection { list, holdout, scale: args.scale, rig: args.rig.clone() }, purpose, overrides, quiet)
+        Self::selected(
+            path,
+            Selection { list, holdout, scale: args.scale, rig: args.rig.clone() },
+            purpose,
+            overrides,
+            quiet,
+        )
     }
 
     /// Reads the keyframes of a list, with their images shrunk to a share of their size.

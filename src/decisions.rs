@@ -367,6 +367,7 @@ mod tests {
             depth: None,
             world_from_camera: Transform::identity(),
             twist: None,
+            joint_twists: [].into(),
             readout_secs: 0.0,
             split,
             truth: None,

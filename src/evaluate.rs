@@ -160,7 +160,22 @@ fn mean(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
 /// The picture a model shows where a keyframe was taken, sheared as the keyframe is.
 pub(crate) fn draw(method: &mut dyn Method, keyframe: &Keyframe) -> Result<Picture, trainer::Error> {
     let lens = method.posed_lens(keyframe)?;
-    method.render(&request(keyframe, &lens))
+    let mut picture = method.render(&request(keyframe, &lens))?;
+    if lens.gains != [1.0; 3] {
+        let by_byte = lens.gains.map(exposed);
+        for [red, green, blue, _] in picture.rgba_srgb.as_chunks_mut::<4>().0 {
+            for (color, table) in [red, green, blue].into_iter().zip(&by_byte) {
+                *color = table[usize::from(*color)];
+            }
+        }
+    }
+    Ok(picture)
+}
+
+/// What each value of a color becomes when multiplied.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to a byte")]
+fn exposed(gain: f64) -> [u8; 256] {
+    std::array::from_fn(|value| (gain * value as f64).round().clamp(0.0, 255.0) as u8)
 }
 
 fn request(keyframe: &Keyframe, lens: &PosedLens) -> RenderRequest {
@@ -179,12 +194,14 @@ fn request(keyframe: &Keyframe, lens: &PosedLens) -> RenderRequest {
 /// Depth has its own size, lens and pose, so it is drawn on its own.
 fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<Option<f64>> {
     let Some(depth) = &keyframe.depth else { return Ok(None) };
+    let lens = method.posed_lens(keyframe)?;
+    let Some(color_from_depth) = lens.color_from_depth else { return Ok(None) };
     let drawn = method.render(&RenderRequest {
-        world_from_camera: depth.world_from_camera,
+        world_from_camera: lens.world_from_camera * color_from_depth,
         size_px: depth.size_px,
         projection: Projection::Pinhole { focal_px: depth.focal_px, principal_px: depth.principal_px },
         shutter: None,
-        ..request(keyframe, &PosedLens::of(keyframe))
+        ..request(keyframe, &lens)
     })?;
     Ok(depth_rmse_m(&drawn.depth_m, &depth.depth_m)?)
 }

@@ -81,6 +81,7 @@ mod tests {
             depth: Some(depth),
             world_from_camera: Transform::translation(1.0, 2.0, 3.0),
             twist: Some(Twist::zero()),
+            joint_twists: [].into(),
             readout_secs: 0.01,
             split: Split::Train,
             truth: None,

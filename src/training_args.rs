@@ -150,7 +150,7 @@ impl Evidence {
             change(&mut set);
             set
         };
-        let poses = one(|set| set.image_poses = true);
+        let [gains, poses] = [one(|set| set.image_gains = true), one(|set| set.image_poses = true)];
         let align = vec![
             one(|set| set.mount = true),
             one(|set| set.delay = true),
@@ -162,9 +162,11 @@ impl Evidence {
             poses,
         ];
         let learn = match self {
-            Self { joints: true, depth: true } => Vec::new(),
-            Self { joints: true, depth: false } => vec![TermSet { mount: true, delay: true, ..TermSet::default() }],
-            Self { joints: false, .. } => vec![poses],
+            Self { joints: true, depth: true } => vec![gains],
+            Self { joints: true, depth: false } => {
+                vec![gains, TermSet { mount: true, delay: true, ..TermSet::default() }]
+            }
+            Self { joints: false, .. } => vec![gains, poses],
         };
         Refining {
             align: CameraChoice::Try(if self.depth { align } else { Vec::new() }),
@@ -190,7 +192,14 @@ mod tests {
     };
 
     fn refining(asked: &[Refine], joints: bool, depth: bool) -> Result<Refining, String> {
-        let args = TrainingArgs { method: None, seed: None, max_bytes: None, max_splats: None, refine: asked.to_vec() };
+        let args = TrainingArgs {
+            method: None,
+            seed: None,
+            max_bytes: None,
+            max_splats: None,
+            refine: asked.to_vec(),
+            count: None,
+        };
         args.refining(Evidence { joints, depth }, Refine::None).map_err(|error| error.to_string())
     }
 

@@ -19,6 +19,8 @@ pub struct Config {
     pub truth_depth: bool,
     /// Factor on the speed of the scanning motion, above 0 to 2; at 1 the camera moves at 0.1 to 0.25 m/s.
     pub speed: f64,
+    /// Whether the camera only turns about the vertical axis: a scan that does not show the whole hand-eye transform.
+    pub azimuth_only: bool,
     /// The rig ends after this simulated time, seconds.
     pub duration_secs: Option<f64>,
     /// The rig ends once the first camera has delivered this many colour images.
@@ -179,6 +181,7 @@ impl Default for Config {
             truth: true,
             truth_depth: false,
             speed: 1.0,
+            azimuth_only: false,
             duration_secs: None,
             n_images: None,
             joint_names: (1..=7).map(|ix| format!("panda_joint{ix}")).collect(),

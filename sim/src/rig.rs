@@ -60,7 +60,7 @@ pub fn open(config: &Config) -> Result<Rig, Error> {
     let cameras = Cameras::new(config)?;
     let model = Arc::new(scene::build(config, cameras.largest_view_px())?);
     let renderer = Renderer::start(Arc::clone(&model))?;
-    let follower = Follower::new(Scan::new(config.speed), scanning_camera(config))?;
+    let follower = Follower::new(Scan::new(config.speed, config.azimuth_only), scanning_camera(config))?;
     let arm = Arm::new(model, follower, history_nanos(config))?;
     let engine = Engine::new(config.clone(), arm, cameras, renderer)?;
     let info = RigInfo {

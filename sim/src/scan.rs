@@ -16,6 +16,7 @@ use std::f64::consts::TAU;
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Scan {
     speed: f64,
+    only_azimuth: bool,
 }
 
 /// One swinging quantity: mean, amplitude, period in seconds at speed 1, phase in turns.
@@ -42,8 +43,13 @@ const START_SECS: f64 = 0.5;
 const SPEED_SWING: (f64, f64) = (0.35, 4.9);
 
 impl Scan {
-    pub(crate) fn new(speed: f64) -> Self {
-        Self { speed }
+    /// With `only_azimuth` all swings but that of the azimuth rest at their means: the camera turns about one axis.
+    pub(crate) fn new(speed: f64, only_azimuth: bool) -> Self {
+        Self { speed, only_azimuth }
+    }
+
+    fn swing(&self, swing: &Swing, at: f64) -> f64 {
+        if self.only_azimuth { swing.0 } else { swing.at(at) }
     }
 
     /// Progress along the tour, in seconds at even speed; starts at rest.
@@ -59,16 +65,17 @@ impl Scan {
     /// Where the camera should be: x right, y down, z to the point looked at.
     pub(crate) fn world_from_camera(&self, secs: f64) -> Transform {
         let at = self.progress(secs);
-        let (azimuth, elevation) = (AZIMUTH_DEGREES.at(at).to_radians(), ELEVATION_DEGREES.at(at).to_radians());
-        let target =
-            Vector3::new(TARGET_XY_M[0] + LOOK_X_M.at(at), TARGET_XY_M[1] + LOOK_Y_M.at(at), TABLE_Z_M + LOOK_ABOVE_M);
+        let azimuth = AZIMUTH_DEGREES.at(at).to_radians();
+        let elevation = self.swing(&ELEVATION_DEGREES, at).to_radians();
+        let [look_x_m, look_y_m] = [&LOOK_X_M, &LOOK_Y_M].map(|swing| self.swing(swing, at));
+        let target = Vector3::new(TARGET_XY_M[0] + look_x_m, TARGET_XY_M[1] + look_y_m, TABLE_Z_M + LOOK_ABOVE_M);
         let back = Vector3::new(-elevation.cos() * azimuth.cos(), -elevation.cos() * azimuth.sin(), elevation.sin());
         let forward = -back;
         let right = forward.cross(&Vector3::z()).normalize();
         let axes = Matrix3::from_columns(&[right, forward.cross(&right), forward]);
         let upright = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
-        let roll = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), ROLL_DEGREES.at(at).to_radians());
-        Transform::from_parts(Translation3::from(target + back * DISTANCE_M.at(at)), upright * roll)
+        let roll = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), self.swing(&ROLL_DEGREES, at).to_radians());
+        Transform::from_parts(Translation3::from(target + back * self.swing(&DISTANCE_M, at)), upright * roll)
     }
 }
 

@@ -19,8 +19,8 @@ use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
-use trainer::{Keyframe, Split};
 use trainer::align::Alignment;
+use trainer::{Keyframe, Split};
 
 /// Length of a training where no flag says.
 const USUAL_SECONDS: f64 = 120.0;

@@ -192,6 +192,8 @@ pub(crate) struct Sim {
     /// The simulation waits for the trainer, and gives the same samples every time.
     pub(crate) lockstep: bool,
     pub(crate) speed: f64,
+    /// The camera turns about the vertical axis only.
+    pub(crate) azimuth_only: bool,
     pub(crate) duration_secs: Option<f64>,
     pub(crate) n_images: Option<u64>,
     pub(crate) truth: bool,

@@ -336,6 +336,7 @@ fn sim(mut keys: Section<'_>) -> Sim {
         ideal: keys.flag("ideal").unwrap_or(false),
         lockstep: keys.flag("lockstep").unwrap_or(false),
         speed: keys.number("speed", 0.01..=2.0).unwrap_or(1.0),
+        azimuth_only: keys.flag("azimuth_only").unwrap_or(false),
         duration_secs: keys.number("duration_secs", 0.001..=1e6),
         n_images: keys.whole("n_images", 1..=1_000_000_000),
         truth: keys.flag("truth").unwrap_or(true),

@@ -46,7 +46,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a good value that differs from the one in force, and a value that is not allowed.
-const KEYS: [(&str, &str, &str); 84] = [
+const KEYS: [(&str, &str, &str); 85] = [
     ("arm.driver", "'franka'", "'frankka'"),
     ("arm.address", "'172.16.0.2'", "7"),
     ("arm.urdf", "'other.urdf'", "7"),
@@ -122,6 +122,7 @@ const KEYS: [(&str, &str, &str); 84] = [
     ("sim.ideal", "true", "'yes'"),
     ("sim.lockstep", "true", "1"),
     ("sim.speed", "0.5", "3"),
+    ("sim.azimuth_only", "true", "1"),
     ("sim.duration_secs", "60", "0"),
     ("sim.n_images", "300", "0"),
     ("sim.truth", "false", "0"),

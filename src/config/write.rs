@@ -144,6 +144,7 @@ fn sim(sim: &Sim) -> Table {
         ("ideal", is(sim.ideal)),
         ("lockstep", is(sim.lockstep)),
         ("speed", is(sim.speed)),
+        ("azimuth_only", is(sim.azimuth_only)),
         ("duration_secs", sim.duration_secs.map(Value::from)),
         ("n_images", sim.n_images.and_then(whole)),
         ("truth", is(sim.truth)),

@@ -70,6 +70,7 @@ fn config_of(rig: &Rig) -> anyhow::Result<sim::Config> {
         truth: rig.sim.truth,
         truth_depth: rig.sim.truth_depth,
         speed: rig.sim.speed,
+        azimuth_only: rig.sim.azimuth_only,
         duration_secs: rig.sim.duration_secs,
         n_images: rig.sim.n_images,
         joint_names: super::chain_of(rig)?.joint_names().to_vec(),

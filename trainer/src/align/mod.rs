@@ -24,7 +24,7 @@ mod view;
 
 pub use report::{Alignment, Found, Moved, Number, Unseen};
 
-use crate::splat::{Candidate, CameraChoice, TermSet, Trial};
+use crate::splat::{CameraChoice, Candidate, TermSet, Trial};
 use crate::{Keyframe, Split};
 use corrections::Corrections;
 use fit::Fit;

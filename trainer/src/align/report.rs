@@ -3,7 +3,7 @@
 use super::layout::Term;
 use super::solve::Solved;
 use super::{Model, Scene};
-use crate::splat::{CameraFix, Trial};
+use crate::splat::{CameraFix, Candidate, Trial};
 use nalgebra::{DVector, Vector3};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -234,6 +234,12 @@ impl Alignment {
     /// Whether anything was kept.
     pub fn is_any(&self) -> bool {
         !self.fixes.is_empty()
+    }
+
+    /// Whether images got poses of their own.
+    pub fn has_image_poses(&self) -> bool {
+        let of_images = |terms: &Candidate| matches!(terms, Candidate::Cameras(terms) if terms.image_poses);
+        self.trials.iter().any(|trial| trial.kept && of_images(&trial.candidate))
     }
 
     /// One line each: what was found, what cannot be seen, what was tried and not needed.

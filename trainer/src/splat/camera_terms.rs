@@ -115,6 +115,8 @@ pub struct CameraFix {
     pub readout_secs: f64,
     /// Turn and shift of the images learned from, by stamp in nanoseconds: between two of them poses drift evenly.
     pub drift: BTreeMap<i64, [f64; 6]>,
+    /// Logarithms of the gains of red, green and blue of the images learned from, likewise.
+    pub log_gains: BTreeMap<i64, [f64; 3]>,
 }
 
 /// A pinhole camera somewhere.
@@ -128,6 +130,10 @@ pub struct PosedLens {
     pub principal_px: [f64; 2],
     /// How it moves while its rows are read, where known.
     pub shutter: Option<Shutter>,
+    /// Pose of the depth frame in this one, where there is depth.
+    pub color_from_depth: Option<Transform>,
+    /// What red, green and blue of a picture are multiplied with to look like the image: its exposure and white balance.
+    pub gains: [f64; 3],
 }
 
 impl PosedLens {
@@ -138,25 +144,16 @@ impl PosedLens {
             focal_px: keyframe.focal_px,
             principal_px: keyframe.principal_px,
             shutter: keyframe.twist.map(|twist| Shutter { twist, readout_secs: keyframe.readout_secs }),
+            color_from_depth: keyframe
+                .depth
+                .as_ref()
+                .map(|depth| keyframe.world_from_camera.inverse() * depth.world_from_camera),
+            gains: [1.0; 3],
         }
     }
 }
 
 impl CameraFix {
-    /// Turn and shift at a stamp, from those of the images before and after it.
-    fn drift_at(&self, stamp: Stamp) -> [f64; 6] {
-        let before = self.drift.range(..=stamp.0).next_back();
-        let after = self.drift.range(stamp.0..).next();
-        match (before, after) {
-            (Some((begin, from)), Some((end, to))) if end > begin => {
-                let share = (stamp.0 - begin) as f64 / (end - begin) as f64;
-                std::array::from_fn(|ix| from[ix] + share * (to[ix] - from[ix]))
-            }
-            (Some((_, drift)), _) | (None, Some((_, drift))) => *drift,
-            (None, None) => [0.0; 6],
-        }
-    }
-
     /// The camera of a keyframe as it is, where the input has it as [`PosedLens::of`].
     pub fn apply(&self, keyframe: &Keyframe) -> PosedLens {
         let lens = PosedLens::of(keyframe);
@@ -168,7 +165,7 @@ impl CameraFix {
         }
         let joints = transform::exp(&by_joints, -1.0);
         let mount = moved(self.turn_rad.into(), self.shift_m.into());
-        let [turn_x, turn_y, turn_z, x, y, z] = self.drift_at(keyframe.stamp);
+        let [turn_x, turn_y, turn_z, x, y, z] = between(&self.drift, keyframe.stamp).unwrap_or_default();
         let drift = moved(Vector3::new(turn_x, turn_y, turn_z), Vector3::new(x, y, z));
         let world_from_camera = (mount * drift * joints * delay * lens.world_from_camera.inverse()).inverse();
         let raw_from_corrected = lens.world_from_camera.inverse() * world_from_camera;
@@ -183,6 +180,8 @@ impl CameraFix {
             principal_px: std::array::from_fn(|axis| {
                 lens.principal_px[axis] + self.principal_focals[axis] * lens.focal_px[axis]
             }),
+            color_from_depth: keyframe.depth.as_ref().map(|depth| self.color_from_depth(keyframe, depth)),
+            gains: between(&self.log_gains, keyframe.stamp).unwrap_or_default().map(f64::exp),
         }
     }
 
@@ -232,6 +231,20 @@ impl CameraFix {
     }
 }
 
+/// What holds at a stamp, from the entries before and after it; `None` of nothing.
+pub(crate) fn between<const N: usize>(known: &BTreeMap<i64, [f64; N]>, stamp: Stamp) -> Option<[f64; N]> {
+    let before = known.range(..=stamp.0).next_back();
+    let after = known.range(stamp.0..).next();
+    match (before, after) {
+        (Some((begin, from)), Some((end, to))) if end > begin => {
+            let share = (stamp.0 - begin) as f64 / (end - begin) as f64;
+            Some(std::array::from_fn(|ix| from[ix] + share * (to[ix] - from[ix])))
+        }
+        (Some((_, value)), _) | (None, Some((_, value))) => Some(*value),
+        (None, None) => None,
+    }
+}
+
 /// Turn, then shift.
 pub(crate) fn moved(turn_rad: Vector3<f64>, shift_m: Vector3<f64>) -> Transform {
     Transform::from_parts(Translation3::from(shift_m), UnitQuaternion::from_scaled_axis(turn_rad))
@@ -248,6 +261,8 @@ pub(crate) fn shares_lens(keyframe: &Keyframe, depth: &DepthMap) -> bool {
     })
 }
 
+/// The first of the gains among the terms, as in `shared/camera_terms.wgsl`.
+const LOG_GAIN: u32 = 11;
 /// Rate of rotations at the start, radians a step; the others follow from it.
 const TURN_RATE: f64 = 1e-3;
 /// What is left of the rates at the end of the plan.
@@ -325,6 +340,19 @@ impl CameraTerms {
             unused: [0; 2],
         };
         Ok(gpu.uniform_with("splat.lens", &lens))
+    }
+
+    /// Lets the gains of an image begin at these logarithms.
+    pub(crate) fn begin_gains(&self, gpu: &Gpu, keyframe: &Keyframe, log_gains: [f64; 3]) {
+        let slot = self.cameras.get(&keyframe.camera).and_then(|slots| slots.images.get(&keyframe.stamp));
+        let values = log_gains.map(|value| [f32_of(value), 0.0, 0.0, 0.0]);
+        if let Some(slot) = slot {
+            gpu.write(
+                &self.terms,
+                SLOT_BYTES * u64::from(*slot) + 16 * u64::from(LOG_GAIN),
+                bytemuck::cast_slice(&values),
+            );
+        }
     }
 
     /// A copy of all terms.
@@ -465,6 +493,8 @@ impl CameraTerms {
         let fix = |slots: &Slots| {
             let of_camera = |term| value(slots.camera, term, set.of_camera());
             let drift = |slot: &u32| [0, 1, 2, 3, 4, 5].map(|term| value(*slot, term, set.of_image()));
+            let log_gains =
+                |slot: &u32| [LOG_GAIN, LOG_GAIN + 1, LOG_GAIN + 2].map(|term| value(*slot, term, set.of_image()));
             CameraFix {
                 turn_rad: [0, 1, 2].map(of_camera),
                 shift_m: [3, 4, 5].map(of_camera),
@@ -473,6 +503,11 @@ impl CameraTerms {
                 principal_focals: [9, 10].map(of_camera),
                 drift: if set.image_poses {
                     slots.images.iter().map(|(stamp, slot)| (stamp.0, drift(slot))).collect()
+                } else {
+                    BTreeMap::new()
+                },
+                log_gains: if set.image_gains {
+                    slots.images.iter().map(|(stamp, slot)| (stamp.0, log_gains(slot))).collect()
                 } else {
                     BTreeMap::new()
                 },

@@ -3,6 +3,7 @@
 
 mod aligning;
 mod checkpoint;
+mod scoring;
 mod size;
 
 use super::arrays::SplatArrays;
@@ -418,6 +419,15 @@ impl SplatTrainer {
 
     /// Makes what the next `n` steps look at and was not looked at before, on all processors.
     fn prepare_levels(&mut self, n: u64) -> Result<(), Error> {
+        let is_there = |step| {
+            let view = &self.views[pick(step, self.views.len(), self.options.seed)];
+            view.has_level(view.clamped(level_at(step, self.coarse_steps)))
+        };
+        if (self.step..self.step + n).all(is_there) {
+            return Ok(());
+        }
+        // Enough at once for all processors, and for the time of a step not to be that of its images.
+        let n = if self.gpu.is_software() { n } else { n.max(MAX_STEPS_PER_SUBMIT) };
         let wanted: BTreeSet<(usize, usize)> = (self.step..self.step + n)
             .map(|step| {
                 let view_ix = pick(step, self.views.len(), self.options.seed);
@@ -643,6 +653,7 @@ impl SplatTrainer {
                     self.trials.begin(candidate, state, self.views.len());
                 }
                 Due::Turn => self.turn_trial()?,
+                Due::Gains => self.try_gains()?,
                 Due::End => {
                     let with_db = self.score_held_back()?;
                     if let Some(instead) = self.trials.end(&with_db) {

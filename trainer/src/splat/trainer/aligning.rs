@@ -6,7 +6,7 @@
 use super::SplatTrainer;
 use crate::align::{self, Alignment};
 use crate::splat::buffers::SplatBuffers;
-use crate::splat::camera_terms::{CameraFix, CameraTerms, PosedLens};
+use crate::splat::camera_terms::{CameraFix, CameraTerms, PosedLens, TermSet};
 use crate::splat::params::status;
 use crate::splat::seed::Seeder;
 use crate::splat::trials::CameraChoice;
@@ -65,7 +65,10 @@ impl Aligning {
     pub(super) fn posed_lens(&self, keyframe: &Keyframe, learned: Option<&CameraFix>) -> PosedLens {
         let posed = |keyframe: &Keyframe| learned.map_or_else(|| PosedLens::of(keyframe), |fix| fix.apply(keyframe));
         match self.fix(&keyframe.camera) {
-            Some(fix) => posed(&fix.corrected(&Keyframe { depth: None, ..keyframe.clone() })),
+            Some(fix) => PosedLens {
+                color_from_depth: keyframe.depth.as_ref().map(|depth| fix.color_from_depth(keyframe, depth)),
+                ..posed(&fix.corrected(&Keyframe { depth: None, ..keyframe.clone() }))
+            },
             None => posed(keyframe),
         }
     }
@@ -112,6 +115,11 @@ impl SplatTrainer {
     fn begin_anew(&mut self) -> Result<(), Error> {
         self.settle()?;
         log::info!("training begins anew with corrected cameras");
+        let poses = TermSet { image_poses: true, ..TermSet::default() };
+        if self.aligning.result().is_some_and(Alignment::has_image_poses) && self.trials.need_not_try(poses) {
+            self.cameras.learn_also(poses); // Depth tells them to a few millimetres; the scene tells them better.
+        }
+        self.step_millis = 0.0;
         self.passes.forget_bindings();
         self.splats = SplatBuffers::new(&self.gpu, 1, self.options.sh_degree)?;
         self.tell_n();

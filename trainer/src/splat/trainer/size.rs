@@ -1,62 +1,17 @@
 //! How large the model has to be: what each splat contributes, what remains without the least of them, what colors need.
 
 use super::SplatTrainer;
+use crate::Error;
 use crate::gpu::Buffer;
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::kernels::LearnPipelines;
-use crate::splat::params::{Camera, Gathering, status};
+use crate::splat::params::{Gathering, status};
 use crate::splat::passes::ViewPasses;
-use crate::splat::views::camera_of;
-use crate::{Error, Keyframe};
 
-/// Most images held back that a score is the mean over, and most views that tell what a splat contributes.
-const MOST_SCORED: usize = 24;
+/// Most views that tell what a splat contributes.
 const MOST_VIEWS: usize = 64;
 
 impl SplatTrainer {
-    /// PSNR of keyframes that were not learned from, dB; of many, some spread over them.
-    pub(super) fn score_held_back(&mut self) -> Result<Vec<f64>, Error> {
-        let learn = self.learn()?;
-        let stride = self.trials.held_back.len().div_ceil(MOST_SCORED).max(1);
-        let mut scores = Vec::new();
-        for ix in (0..self.trials.held_back.len()).step_by(stride) {
-            let image = match self.trials.held_back[ix].image.take() {
-                Some(image) => image,
-                None => self.gpu.storage_with("splat.held_back", &self.trials.held_back[ix].keyframe.rgba_srgb)?,
-            };
-            let keyframe = self.trials.held_back[ix].keyframe.clone();
-            scores.extend(self.score(&learn, &keyframe, &image)?);
-            self.trials.held_back[ix].image = Some(image);
-        }
-        Ok(scores)
-    }
-
-    /// PSNR of the model as it learns, of one image; `None` where nothing was seen.
-    fn score(&mut self, learn: &LearnPipelines, keyframe: &Keyframe, image: &Buffer) -> Result<Option<f64>, Error> {
-        let lens = self.learned_lens(keyframe)?;
-        let camera = Camera {
-            world_from_camera: lens.world_from_camera,
-            focal_px: lens.focal_px,
-            principal_px: lens.principal_px,
-            ..camera_of(keyframe)
-        };
-        self.draw_into_frame(&camera, [0.0; 3], false)?;
-        let Some(frame) = &self.draw_frame else { return Err(Error::DeviceLost) };
-        let n_groups = (camera.size_px[0] * camera.size_px[1]).div_ceil(256);
-        let buffers = [
-            ("view", &self.draw_view),
-            ("pixels", &frame.pixels),
-            ("target_image", image),
-            ("squares", &frame.squares),
-        ];
-        self.passes.dispatch(&self.gpu, &learn.score, n_groups.into(), &buffers);
-        self.passes.submit(&self.gpu);
-        let sums: Vec<[u32; 2]> = self.gpu.read(&frame.squares, n_groups as usize)?;
-        let [square, n_seen] = [0, 1].map(|part| sums.iter().map(|sum| u64::from(sum[part])).sum::<u64>());
-        let mean_square = square.max(1) as f64 / (3 * n_seen) as f64; // One level of one color: nothing is better.
-        Ok((n_seen > 0).then(|| 10.0 * (255.0f64.powi(2) / mean_square).log10()))
-    }
-
     /// What each splat contributes to the views: the sum of its blending weights, in pixels.
     pub(super) fn contributions(&mut self, learn: &LearnPipelines) -> Result<Vec<f32>, Error> {
         let contributions = self.gpu.storage("splat.contributions", 4 * u64::from(self.splats.n_splats))?;
@@ -170,7 +125,7 @@ mod tests {
     use crate::splat::learning::{n_keyframes, options, request, test_psnr, train};
     use crate::splat::trials::{Candidate, CountChoice};
     use crate::splat::{SplatOptions, Trial};
-    use crate::{Method, Split};
+    use crate::{Keyframe, Method, Split};
     use std::sync::Arc;
 
     fn trained(count: CountChoice, keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, n_steps: u64) -> SplatTrainer {
@@ -187,19 +142,6 @@ mod tests {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
         let keyframes = n_keyframes(&gpu, 12, true);
         (trained(CountChoice::Tested, &keyframes, gpu, n_steps), keyframes)
-    }
-
-    #[test]
-    fn scores_are_those_of_the_pictures() {
-        let (mut trainer, keyframes) = some_trained(60);
-        let held_back: Vec<_> = keyframes.iter().filter(|keyframe| keyframe.split == Split::Selection).collect();
-        let scores = trainer.score_held_back().unwrap();
-        assert_eq!(scores.len(), held_back.len());
-        for (score, keyframe) in scores.iter().zip(held_back) {
-            let picture = trainer.render(&request(keyframe.world_from_camera)).unwrap();
-            let pair = PixelPair::new(keyframe.size_px, &picture.rgba_srgb, &keyframe.rgba_srgb).unwrap();
-            assert!((psnr(&pair).unwrap() - score).abs() < 1e-9);
-        }
     }
 
     /// What blends into a pixel and what it lets through sum to one.
