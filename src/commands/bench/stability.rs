@@ -13,7 +13,7 @@ use serde::Serialize;
 use std::collections::HashSet;
 use std::path::PathBuf;
 use std::sync::Arc;
-use trainer::splat::SplatOptions;
+use trainer::splat::{CameraChoice, SplatOptions};
 use trainer::{Keyframe, Split};
 
 /// Length of a run where no flag says.
@@ -30,7 +30,13 @@ struct Variant {
     change: fn(SplatOptions) -> SplatOptions,
 }
 
-const VARIANTS: &[Variant] = &[Variant { name: "plain", change: |options| options }];
+const VARIANTS: &[Variant] = &[
+    Variant { name: "as settled by --refine", change: |options| options },
+    Variant {
+        name: "cameras as given",
+        change: |options| SplatOptions { cameras: CameraChoice::default(), align: CameraChoice::default(), ..options },
+    },
+];
 
 /// Flags of `bench stability`.
 #[derive(Debug, clap::Args)]
@@ -63,7 +69,7 @@ pub(crate) struct Args {
 enum What {
     /// Training poses off by 0 to 50 mm and 0 to 5 degrees
     PoseNoise,
-    /// Training poses of a time 0 to 200 ms later
+    /// Poses of a time 0 to 200 ms later
     ClockOffset,
     /// A step of 0 to 1 EV in the middle of the capture
     Exposure,

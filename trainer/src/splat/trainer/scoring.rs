@@ -22,6 +22,9 @@ struct Products {
     n_seen: u64,
 }
 
+/// A keyframe and how the picture of it compares.
+type Compared = (Arc<Keyframe>, [Products; 3]);
+
 /// PSNR, dB, of a picture whose colors are multiplied; `None` where nothing was seen. What would be brighter than white counts
 /// as it is.
 fn psnr_with(products: &[Products; 3], gains: [f64; 3]) -> Option<f64> {
@@ -109,7 +112,7 @@ impl SplatTrainer {
         Ok(log_gains(&drawn.compare(&mut self.passes, &keyframe, image)?))
     }
 
-    fn compare_held_back(&mut self) -> Result<Vec<(Arc<Keyframe>, [Products; 3])>, Error> {
+    fn compare_held_back(&mut self) -> Result<Vec<Compared>, Error> {
         let stride = self.trials.held_back.len().div_ceil(MOST_SCORED).max(1);
         let mut compared = Vec::new();
         for ix in (0..self.trials.held_back.len()).step_by(stride) {
