@@ -217,7 +217,7 @@ mod tests {
             CameraChoice::Given(_) => panic!("auto tries"),
         };
         for (joints, depth, aligned, learned) in
-            [(true, true, 8, 0), (true, false, 0, 1), (false, true, 8, 1), (false, false, 0, 1)]
+            [(true, true, 8, 1), (true, false, 0, 2), (false, true, 8, 2), (false, false, 0, 2)]
         {
             let Refining { align, learn } = refining(&[Refine::Auto], joints, depth).unwrap();
             assert_eq!((candidates(align), candidates(learn)), (aligned, learned), "joints {joints}, depth {depth}");

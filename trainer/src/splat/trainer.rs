@@ -433,9 +433,14 @@ impl SplatTrainer {
                 let view_ix = pick(step, self.views.len(), self.options.seed);
                 (view_ix, self.views[view_ix].clamped(level_at(step, self.coarse_steps)))
             })
-            .filter(|(view_ix, level)| !self.views[*view_ix].has_level(*level))
             .collect();
-        let wanted: Vec<(usize, usize)> = wanted.into_iter().collect();
+        self.make_levels(wanted)
+    }
+
+    /// Makes what is not there yet of these views and levels, on all processors.
+    fn make_levels(&mut self, wanted: BTreeSet<(usize, usize)>) -> Result<(), Error> {
+        let wanted: Vec<(usize, usize)> =
+            wanted.into_iter().filter(|(view_ix, level)| !self.views[*view_ix].has_level(*level)).collect();
         let made: Vec<LevelImages> = wanted
             .par_iter()
             .map(|(view_ix, level)| LevelImages::new(&self.views[*view_ix].keyframe, *level))

@@ -16,7 +16,7 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 
 /// The step at which the result is taken, waiting for it where needed: on a processor steps are as dear as alignment.
-const TAKEN_AT: u64 = 300;
+const TAKEN_AT: u64 = 400;
 const TAKEN_AT_ON_SOFTWARE: u64 = 50;
 
 /// Where alignment stands.
@@ -74,6 +74,15 @@ impl Aligning {
     }
 }
 
+/// Aligns on threads of its own: training, which makes images smaller on all processors, is not to wait for it.
+fn beside_training(keyframes: &[Arc<Keyframe>], choice: &CameraChoice) -> Option<Alignment> {
+    let n_processors = std::thread::available_parallelism().map_or(1, usize::from);
+    match rayon::ThreadPoolBuilder::new().num_threads((3 * n_processors).div_ceil(4)).build() {
+        Ok(pool) => pool.install(|| align::align(keyframes, choice)),
+        Err(_) => align::align(keyframes, choice),
+    }
+}
+
 impl SplatTrainer {
     /// Steps that may be taken before alignment is due.
     pub(super) fn steps_to_alignment(&self) -> u64 {
@@ -92,7 +101,7 @@ impl SplatTrainer {
             let held_back = self.trials.held_back.iter().map(|held_back| held_back.keyframe.clone());
             let keyframes: Vec<Arc<Keyframe>> = views.chain(held_back).collect();
             let choice = self.options.align.clone();
-            self.aligning = Aligning::Running(std::thread::spawn(move || align::align(&keyframes, &choice)));
+            self.aligning = Aligning::Running(std::thread::spawn(move || beside_training(&keyframes, &choice)));
         }
         if self.step < self.aligned_at() || self.aligning.is_done() {
             return Ok(());

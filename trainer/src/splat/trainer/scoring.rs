@@ -58,6 +58,7 @@ impl SplatTrainer {
     pub(super) fn try_gains(&mut self) -> Result<(), Error> {
         let held_back = self.compare_held_back()?;
         let neighbors: Vec<Vec<usize>> = held_back.iter().map(|(keyframe, _)| self.neighbors(keyframe)).collect();
+        self.make_levels(neighbors.iter().flatten().map(|view_ix| (*view_ix, 0)).collect())?;
         let mut known: BTreeMap<usize, [f64; 3]> = BTreeMap::new();
         for view_ix in neighbors.iter().flatten() {
             if !known.contains_key(view_ix) {
@@ -82,6 +83,7 @@ impl SplatTrainer {
         if let Some(gains) = self.trials.end_gains(&without_db, &with_db) {
             self.cameras.learn_also(gains);
             self.begin_learning()?;
+            self.make_levels((0..self.views.len()).map(|view_ix| (view_ix, 0)).collect())?;
             for view_ix in 0..self.views.len() {
                 let gains = match known.get(&view_ix) {
                     Some(gains) => *gains,
