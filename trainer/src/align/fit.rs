@@ -5,7 +5,7 @@ use super::frame::Frame;
 use super::layout::Layout;
 use super::pairs::Pair;
 use super::solve::Solved;
-use super::sums::{self, Looks, Noise};
+use super::sums::{self, Looks, Noise, Part};
 
 /// Steps at each level, the finest first.
 const ROUNDS: [usize; 4] = [12, 4, 4, 4];
@@ -28,7 +28,8 @@ pub(super) struct Fit {
 pub(super) fn fit(frames: &[Frame], pairs: &[Pair], layout: Layout, from: &Corrections) -> Option<Fit> {
     let mut corrections = from.clone();
     let n_levels = frames.iter().map(|frame| frame.levels.len()).max()?;
-    let mut how = Looks { level: n_levels - 1, hidden_frac: HIDDEN_FRAC[n_levels - 1], noise: FIRST_NOISE };
+    let mut how =
+        Looks { level: n_levels - 1, hidden_frac: HIDDEN_FRAC[n_levels - 1], noise: FIRST_NOISE, part: Part::All };
     how.noise = sums::noise_of(&sums::of_pairs(frames, &corrections.views(frames, &layout), pairs, &how))?;
     let mut last = None;
     for level in (0..n_levels).rev() {

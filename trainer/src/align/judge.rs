@@ -4,8 +4,10 @@ use super::corrections::Corrections;
 use super::frame::Frame;
 use super::layout::Layout;
 use super::pairs::Pair;
-use super::residual::Look;
-use super::sums::{self, Looks, Noise};
+use super::poses;
+use super::residual::{Look, Side};
+use super::sums::{self, Looks, Noise, Part};
+use super::view::View;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
@@ -17,34 +19,97 @@ const HIDDEN_FRAC: f64 = 0.04;
 /// Fewer spots make no score.
 const LEAST_SPOTS: usize = 30;
 
-/// PSNR, dB, of each selection image as its partners predict it, without and with: at the same spots.
-pub(super) fn scores(
-    frames: &[Frame],
-    pairs: &[Pair],
-    without: &Corrections,
-    with: &Corrections,
-    noise: Noise,
-) -> (Vec<f64>, Vec<f64>) {
-    let how = Looks { level: 0, hidden_frac: HIDDEN_FRAC, noise };
-    let views = [without, with].map(|corrections| corrections.views(frames, &Layout::default()));
-    let errors = |pair: &Pair| {
-        let spots = &frames[pair.from].even_spots;
-        let looks = [0, 1].map(|ix: usize| sums::looks(frames, &views[ix], *pair, spots, &how));
+/// What is compared: selection images as their partners predict them, without a correction and with it.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Compared<'a> {
+    pub(super) frames: &'a [Frame],
+    /// From training images to selection images.
+    pub(super) pairs: &'a [Pair],
+    pub(super) without: &'a Corrections,
+    pub(super) with: &'a Corrections,
+    pub(super) noise: Noise,
+}
+
+/// Spots, and squares of what is left without and with.
+type Errors = (usize, f64, f64);
+
+impl Compared<'_> {
+    /// PSNR, dB, of each selection image where the corrections have it, without and with: at the same spots.
+    pub(super) fn scores(&self) -> (Vec<f64>, Vec<f64>) {
+        let views = self.views();
+        let errors = |pair: &Pair| {
+            let sides = [0, 1].map(|ix: usize| sums::sides(self.frames, &views[ix], *pair));
+            (pair.to, self.errors(sides, Part::All))
+        };
+        let errors: Vec<(usize, Errors)> = self.pairs.par_iter().map(errors).collect();
+        let mut by_image: BTreeMap<usize, Errors> = BTreeMap::new();
+        for (to, errors) in errors.into_iter().filter(|(_, (n, ..))| *n > LEAST_SPOTS) {
+            add(by_image.entry(to).or_default(), errors);
+        }
+        by_image.into_values().map(psnr).unzip()
+    }
+
+    /// The same where each selection image has a pose of its own, found on one half of its blocks and scored on the other, and
+    /// the other way round.
+    ///
+    /// This asks whether the training images agree better with each other: from images that are apart no single pose fits what
+    /// all of them predict. To ask nothing else, the selection image may move without the correction just as with it: by the same
+    /// residuals, prior and number of steps, towards the same partners, and both are scored at the spots that both show. So the
+    /// freedom of a pose is on both sides, what it learns from noise costs it on the half that it has not seen, and it never
+    /// matters whether the selection image's own pose can be guessed. The correction itself has seen nothing of these images.
+    pub(super) fn own_scores(&self) -> (Vec<f64>, Vec<f64>) {
+        let views = self.views();
+        let mut by_image: BTreeMap<usize, Vec<Pair>> = BTreeMap::new();
+        for pair in self.pairs {
+            by_image.entry(pair.to).or_default().push(*pair);
+        }
+        let images: Vec<(usize, Vec<Pair>)> = by_image.into_iter().collect();
+        let of_half = |to: usize, pairs: &[Pair], odd: bool| {
+            let frame = &self.frames[to];
+            let own = |corrections: &Corrections, views: &[View]| {
+                let fix = &corrections.fixes[frame.camera];
+                let fix = poses::fit_one(self.frames, views, pairs, fix, Part::Blocks { odd })?;
+                View::new(frame, &fix, &Layout::default())
+            };
+            let own = [own(self.without, &views[0])?, own(self.with, &views[1])?];
+            let mut sum = Errors::default();
+            for pair in pairs {
+                let from = |ix: usize| Side { frame: &self.frames[pair.from], view: &views[ix][pair.from] };
+                let sides = [0, 1].map(|ix| [from(ix), Side { frame, view: &own[ix] }]);
+                add(&mut sum, self.errors(sides, Part::Blocks { odd: !odd }));
+            }
+            Some(sum)
+        };
+        let of = |(to, pairs): &(usize, Vec<Pair>)| {
+            let mut sum = of_half(*to, pairs, false)?;
+            add(&mut sum, of_half(*to, pairs, true)?);
+            (sum.0 > LEAST_SPOTS).then(|| psnr(sum))
+        };
+        images.par_iter().filter_map(of).collect::<Vec<_>>().into_iter().unzip()
+    }
+
+    fn views(&self) -> [Vec<View>; 2] {
+        [self.without, self.with].map(|corrections| corrections.views(self.frames, &Layout::default()))
+    }
+
+    /// Of a pair, without and with, at the spots that both show.
+    fn errors(&self, sides: [[Side<'_>; 2]; 2], part: Part) -> Errors {
+        let how = Looks { level: 0, hidden_frac: HIDDEN_FRAC, noise: self.noise, part };
+        let looks = sides.map(|sides| sums::looks(sides, &sides[0].frame.even_spots, &how));
         let both = || looks[0].iter().zip(&looks[1]).filter_map(|(one, other)| one.as_ref().zip(other.as_ref()));
         let sum = |looks: Vec<&Look>| {
-            let tone = sums::tone(looks.iter().copied(), noise.photo);
+            let tone = sums::tone(looks.iter().copied(), self.noise.photo);
             looks.iter().map(|look| look.photo(tone).clamp(-CLIP, CLIP).powi(2)).sum::<f64>()
         };
-        let n = both().count();
-        (pair.to, n, sum(both().map(|(one, _)| one).collect()), sum(both().map(|(_, other)| other).collect()))
-    };
-    let errors: Vec<(usize, usize, f64, f64)> = pairs.par_iter().map(errors).collect();
-    let mut by_image: BTreeMap<usize, (usize, f64, f64)> = BTreeMap::new();
-    for (to, n, without, with) in errors.into_iter().filter(|(_, n, _, _)| *n > LEAST_SPOTS) {
-        let sums = by_image.entry(to).or_default();
-        *sums = (sums.0 + n, sums.1 + without, sums.2 + with);
+        (both().count(), sum(both().map(|(one, _)| one).collect()), sum(both().map(|(_, other)| other).collect()))
     }
-    let psnr =
-        |n: usize, squares: f64| 10.0 * (255.0 * 255.0 / (squares / n as f64 + IMAGE_NOISE * IMAGE_NOISE)).log10();
-    by_image.into_values().map(|(n, without, with)| (psnr(n, without), psnr(n, with))).unzip()
+}
+
+fn add(sum: &mut Errors, errors: Errors) {
+    *sum = (sum.0 + errors.0, sum.1 + errors.1, sum.2 + errors.2);
+}
+
+fn psnr((n, without, with): Errors) -> (f64, f64) {
+    let psnr = |squares: f64| 10.0 * (255.0 * 255.0 / (squares / n as f64 + IMAGE_NOISE * IMAGE_NOISE)).log10();
+    (psnr(without), psnr(with))
 }

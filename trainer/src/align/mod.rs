@@ -34,6 +34,7 @@ use pairs::Pair;
 use rayon::prelude::*;
 use std::collections::BTreeSet;
 use std::sync::Arc;
+use sums::Part;
 
 /// Frames that shared terms are found from, and partners of each.
 const MOST_FRAMES: usize = 100;
@@ -72,6 +73,7 @@ pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraChoice) -> Option<Align
         }
         CameraChoice::Try(candidates) => scene.choose(candidates, nothing, &mut trials),
     };
+    let kept = if kept.set.image_poses { scene.with_judges(kept) } else { kept };
     Some(report::alignment(&scene, &kept, trials))
 }
 
@@ -130,10 +132,28 @@ impl Scene {
             fit = Some(found);
         }
         if set.image_poses {
-            let from_joints = self.frames.iter().any(|frame| !frame.keyframe.joint_twists.is_empty());
-            (corrections, _) = poses::fit(&self.frames, &self.all_pairs, &corrections, from_joints)?;
+            (corrections, _) = poses::fit(&self.frames, &self.all_pairs, &corrections)?;
         }
         Some(Model { set, fit, corrections })
+    }
+
+    /// Gives selection images poses of their own, too, when all is decided: they are learned from later.
+    fn with_judges(&self, mut model: Model) -> Model {
+        let of = |split: Split| -> Vec<usize> {
+            (0..self.frames.len()).filter(|ix| self.frames[*ix].keyframe.split == split).collect()
+        };
+        let views = model.corrections.views(&self.frames, &Layout::default());
+        let own = |to: &usize| {
+            let pairs = pairs::choose(&self.frames, &views, &of(Split::Train), &[*to], PARTNERS);
+            let frame = &self.frames[*to];
+            let fix = poses::fit_one(&self.frames, &views, &pairs, &model.corrections.fixes[frame.camera], Part::All)?;
+            Some((frame.camera, frame.keyframe.stamp.0, fix.drift_at(frame.keyframe.stamp)))
+        };
+        let found: Vec<_> = of(Split::Selection).par_iter().filter_map(own).collect();
+        for (camera, stamp, drift) in found {
+            model.corrections.fixes[camera].drift.insert(stamp, drift);
+        }
+        model
     }
 
     /// What given corrections say about the terms of a layout, and nothing about others.
@@ -180,12 +200,27 @@ impl Scene {
     /// How much better a set of terms predicts the selection images.
     fn judge(&self, terms: TermSet, without: &Model, with: &Model) -> Trial {
         let noise = with.fit.as_ref().map_or(sums::Noise { photo: 5.0, depth: 0.005 }, |fit| fit.noise);
-        let (without_db, with_db) =
-            judge::scores(&self.frames, &self.judging, &without.corrections, &with.corrections, noise);
-        log::debug!("alignment: {terms}: without {without_db:.2?}, with {with_db:.2?} dB");
-        let mut trial = Trial::of(Candidate::Cameras(terms), &without_db, &with_db);
-        trial.kept &= trial.n_images >= LEAST_JUDGES;
-        trial
+        let compared = judge::Compared {
+            frames: &self.frames,
+            pairs: &self.judging,
+            without: &without.corrections,
+            with: &with.corrections,
+            noise,
+        };
+        let trial = |(without_db, with_db): (Vec<f64>, Vec<f64>)| {
+            log::debug!("alignment: {terms}: without {without_db:.2?}, with {with_db:.2?} dB");
+            let mut trial = Trial::of(Candidate::Cameras(terms), &without_db, &with_db);
+            trial.kept &= trial.n_images >= LEAST_JUDGES;
+            trial
+        };
+        match (terms.image_poses, without.set.image_poses) {
+            (true, _) => trial(compared.own_scores()),
+            (false, false) => trial(compared.scores()),
+            // Images that move on their own hide what all share: it goes only where neither way shows it.
+            (false, true) => Some(trial(compared.scores()))
+                .filter(|trial| trial.kept)
+                .unwrap_or_else(|| trial(compared.own_scores())),
+        }
     }
 }
 

@@ -81,6 +81,11 @@ impl Look {
         })
     }
 
+    /// Where `j` shows it.
+    pub(super) fn pixel(&self) -> [f64; 2] {
+        self.j.pixel
+    }
+
     pub(super) fn brightness(&self) -> [f64; 2] {
         [self.i.brightness, self.j.brightness]
     }
@@ -188,7 +193,12 @@ impl<'a> Placed<'a> {
             _ => (begin + part, Vector3::zeros(), unit(part - 3)),
         };
         let columns = (0..6).map(motion).collect();
-        Self { view, columns, depth_pose: None, lens: None, depth_scale: None, readout: None }
+        Self { columns, ..Self::still(view) }
+    }
+
+    /// Nothing changes.
+    pub(super) fn still(view: &'a View) -> Self {
+        Self { view, columns: Vec::new(), depth_pose: None, lens: None, depth_scale: None, readout: None }
     }
 }
 

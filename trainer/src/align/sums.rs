@@ -30,6 +30,30 @@ pub(super) struct Looks {
     /// By how much readings may differ before they count as another surface's.
     pub(super) hidden_frac: f64,
     pub(super) noise: Noise,
+    pub(super) part: Part,
+}
+
+/// Which pixels of the second image of a pair are looked at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Part {
+    All,
+    /// One half of its blocks, as of a checkerboard: what is found on one is judged on the other.
+    Blocks {
+        odd: bool,
+    },
+}
+
+impl Part {
+    fn shows(self, pixel: [f64; 2]) -> bool {
+        const BLOCK_PX: f64 = 64.0;
+        match self {
+            Self::All => true,
+            Self::Blocks { odd } => {
+                let [column, row] = pixel.map(|place| (place / BLOCK_PX).floor());
+                ((column + row) % 2.0 != 0.0) == odd
+            }
+        }
+    }
 }
 
 /// What one pair says.
@@ -44,11 +68,15 @@ pub(super) struct PairSums {
     depth: Vec<f64>,
 }
 
-/// The spots of a pair that both frames show.
-pub(super) fn looks(frames: &[Frame], views: &[View], pair: Pair, spots: &[Spot], how: &Looks) -> Vec<Option<Look>> {
-    let side = |ix: usize| Side { frame: &frames[ix], view: &views[ix] };
-    let (i, j) = (side(pair.from), side(pair.to));
-    spots.iter().map(|spot| Look::new(i, j, spot, how.level, how.hidden_frac)).collect()
+/// The spots of the first of two frames that both show, in the part of the second that is looked at.
+pub(super) fn looks([i, j]: [Side<'_>; 2], spots: &[Spot], how: &Looks) -> Vec<Option<Look>> {
+    let look = |spot: &Spot| Look::new(i, j, spot, how.level, how.hidden_frac);
+    spots.iter().map(|spot| look(spot).filter(|look| how.part.shows(look.pixel()))).collect()
+}
+
+/// The frames of a pair.
+pub(super) fn sides<'a>(frames: &'a [Frame], views: &'a [View], pair: Pair) -> [Side<'a>; 2] {
+    [pair.from, pair.to].map(|ix| Side { frame: &frames[ix], view: &views[ix] })
 }
 
 /// Gain and offset by weighted squares, weights by what was left before.
@@ -90,7 +118,7 @@ pub(super) fn of_pairs(frames: &[Frame], views: &[View], pairs: &[Pair], how: &L
         terms.dedup();
         let place = |term: usize| terms.partition_point(|known| *known < term);
         let placed = [Placed::new(i, place), Placed::new(j, place)];
-        of_pair(frames, views, *pair, &placed, terms.clone(), how)
+        of_pair(sides(frames, views, *pair), &placed, terms.clone(), how)
     };
     pairs.par_iter().map(of).collect()
 }
@@ -99,19 +127,18 @@ pub(super) fn of_pairs(frames: &[Frame], views: &[View], pairs: &[Pair], how: &L
 pub(super) fn of_free_pairs(frames: &[Frame], views: &[View], pairs: &[Pair], how: &Looks) -> Vec<PairSums> {
     let of = |pair: &Pair| {
         let placed = [Placed::free(&views[pair.from], 0), Placed::free(&views[pair.to], 6)];
-        of_pair(frames, views, *pair, &placed, (0..12).collect(), how)
+        of_pair(sides(frames, views, *pair), &placed, (0..12).collect(), how)
     };
     pairs.par_iter().map(of).collect()
 }
 
-fn of_pair(
-    frames: &[Frame],
-    views: &[View],
-    pair: Pair,
-    [i, j]: &[Placed<'_>; 2],
-    terms: Vec<usize>,
-    how: &Looks,
-) -> PairSums {
+/// What a pair says about the motion of its second camera, where the first stays.
+pub(super) fn of_second(sides: [Side<'_>; 2], how: &Looks) -> PairSums {
+    let placed = [Placed::still(sides[0].view), Placed::free(sides[1].view, 0)];
+    of_pair(sides, &placed, (0..6).collect(), how)
+}
+
+fn of_pair(sides: [Side<'_>; 2], [i, j]: &[Placed<'_>; 2], terms: Vec<usize>, how: &Looks) -> PairSums {
     let n = terms.len();
     let mut sums = PairSums {
         terms,
@@ -120,7 +147,7 @@ fn of_pair(
         photo: Vec::new(),
         depth: Vec::new(),
     };
-    let looks: Vec<Look> = looks(frames, views, pair, &frames[pair.from].spots, how).into_iter().flatten().collect();
+    let looks: Vec<Look> = looks(sides, &sides[0].frame.spots, how).into_iter().flatten().collect();
     if looks.len() < LEAST_SPOTS {
         return sums;
     }

@@ -90,7 +90,7 @@ impl std::fmt::Display for TermSet {
 }
 
 /// What was learned about one camera.
-#[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default)]
 pub struct CameraFix {
     /// Rotation vector in the camera's own axes, radians: `camera_from_world` becomes turn and shift after it.
@@ -115,8 +115,30 @@ pub struct CameraFix {
     pub readout_secs: f64,
     /// Turn and shift of the images learned from, by stamp in nanoseconds: between two of them poses drift evenly.
     pub drift: BTreeMap<i64, [f64; 6]>,
+    /// How much of the drift between them holds for images that are not among them, 0 to 1; see [`drift_share`].
+    pub drift_share: f64,
     /// Logarithms of the gains of red, green and blue of the images learned from, likewise.
     pub log_gains: BTreeMap<i64, [f64; 3]>,
+}
+
+impl Default for CameraFix {
+    fn default() -> Self {
+        Self {
+            turn_rad: [0.0; 3],
+            shift_m: [0.0; 3],
+            delay_secs: 0.0,
+            log_focal: [0.0; 2],
+            principal_focals: [0.0; 2],
+            joint_offsets: Vec::new(),
+            depth_turn_rad: [0.0; 3],
+            depth_shift_m: [0.0; 3],
+            log_depth_scale: 0.0,
+            readout_secs: 0.0,
+            drift: BTreeMap::new(),
+            drift_share: 1.0,
+            log_gains: BTreeMap::new(),
+        }
+    }
 }
 
 /// A pinhole camera somewhere.
@@ -165,7 +187,7 @@ impl CameraFix {
         }
         let joints = transform::exp(&by_joints, -1.0);
         let mount = moved(self.turn_rad.into(), self.shift_m.into());
-        let [turn_x, turn_y, turn_z, x, y, z] = between(&self.drift, keyframe.stamp).unwrap_or_default();
+        let [turn_x, turn_y, turn_z, x, y, z] = self.drift_at(keyframe.stamp);
         let drift = moved(Vector3::new(turn_x, turn_y, turn_z), Vector3::new(x, y, z));
         let world_from_camera = (mount * drift * joints * delay * lens.world_from_camera.inverse()).inverse();
         let raw_from_corrected = lens.world_from_camera.inverse() * world_from_camera;
@@ -183,6 +205,12 @@ impl CameraFix {
             color_from_depth: keyframe.depth.as_ref().map(|depth| self.color_from_depth(keyframe, depth)),
             gains: between(&self.log_gains, keyframe.stamp).unwrap_or_default().map(f64::exp),
         }
+    }
+
+    /// Turn and shift of an image: its own, or as far as poses drift those between its neighbours in time.
+    pub(crate) fn drift_at(&self, stamp: Stamp) -> [f64; 6] {
+        let share = if self.drift.contains_key(&stamp.0) { 1.0 } else { self.drift_share };
+        between(&self.drift, stamp).unwrap_or_default().map(|part| share * part)
     }
 
     /// From the camera as the input has it to the camera at the time the image was taken.
@@ -243,6 +271,31 @@ pub(crate) fn between<const N: usize>(known: &BTreeMap<i64, [f64; N]>, stamp: St
         (Some((_, value)), _) | (None, Some((_, value))) => Some(*value),
         (None, None) => None,
     }
+}
+
+/// How much of the drift between images holds for another image, 0 to 1: each image is left out and guessed from its neighbours
+/// in time, and the share is 1 less what is left of all corrections, by squares.
+///
+/// 0 where each image errs on its own, where a guess leaves more than nothing would, and where there are too few to tell.
+///
+/// * `scene_size_m`: what makes a turn a way.
+pub(crate) fn drift_share(drift: &BTreeMap<i64, [f64; 6]>, scene_size_m: f64) -> f64 {
+    /// Less may be chance.
+    const LEAST: f64 = 0.2;
+    let known: Vec<(f64, &[f64; 6])> = drift.iter().map(|(stamp, parts)| (*stamp as f64, parts)).collect();
+    let squares = |parts: [f64; 6]| {
+        let [turn, shift] = [&parts[..3], &parts[3..]].map(|parts| parts.iter().map(|x| x * x).sum::<f64>());
+        turn * scene_size_m * scene_size_m + shift
+    };
+    let (mut left, mut all) = (0.0, 0.0);
+    for neighbors in known.windows(3) {
+        let [(begin, from), (stamp, own), (end, to)] = [neighbors[0], neighbors[1], neighbors[2]];
+        let frac = (stamp - begin) / (end - begin);
+        left += squares(std::array::from_fn(|ix| own[ix] - from[ix] - frac * (to[ix] - from[ix])));
+        all += squares(*own);
+    }
+    let share = if all > 0.0 { 1.0 - left / all } else { 0.0 };
+    if share < LEAST { 0.0 } else { share }
 }
 
 /// Turn, then shift.
@@ -482,7 +535,13 @@ impl CameraTerms {
     }
 
     /// What the terms, or a copy of them, tell about each camera.
-    pub(crate) fn fixes(&self, gpu: &Gpu, set: TermSet, terms: &Buffer) -> Result<BTreeMap<String, CameraFix>, Error> {
+    pub(crate) fn fixes(
+        &self,
+        gpu: &Gpu,
+        set: TermSet,
+        terms: &Buffer,
+        scene_size_m: f64,
+    ) -> Result<BTreeMap<String, CameraFix>, Error> {
         // A copy may be older than the last slots.
         let mut terms: Vec<[f32; 4]> = gpu.read(terms, (self.used_bytes().min(terms.bytes()) / 16) as usize)?;
         terms.resize((self.n_used * N_TERMS) as usize, [0.0; 4]);
@@ -495,17 +554,19 @@ impl CameraTerms {
             let drift = |slot: &u32| [0, 1, 2, 3, 4, 5].map(|term| value(*slot, term, set.of_image()));
             let log_gains =
                 |slot: &u32| [LOG_GAIN, LOG_GAIN + 1, LOG_GAIN + 2].map(|term| value(*slot, term, set.of_image()));
+            let drift: BTreeMap<i64, [f64; 6]> = if set.image_poses {
+                slots.images.iter().map(|(stamp, slot)| (stamp.0, drift(slot))).collect()
+            } else {
+                BTreeMap::new()
+            };
             CameraFix {
                 turn_rad: [0, 1, 2].map(of_camera),
                 shift_m: [3, 4, 5].map(of_camera),
                 delay_secs: of_camera(6),
                 log_focal: [7, 8].map(of_camera),
                 principal_focals: [9, 10].map(of_camera),
-                drift: if set.image_poses {
-                    slots.images.iter().map(|(stamp, slot)| (stamp.0, drift(slot))).collect()
-                } else {
-                    BTreeMap::new()
-                },
+                drift_share: if set.image_poses { drift_share(&drift, scene_size_m) } else { 1.0 },
+                drift,
                 log_gains: if set.image_gains {
                     slots.images.iter().map(|(stamp, slot)| (stamp.0, log_gains(slot))).collect()
                 } else {

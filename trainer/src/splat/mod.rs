@@ -27,7 +27,7 @@ mod trials;
 mod views;
 
 pub use camera_terms::{CameraFix, PosedLens, TermSet};
-pub(crate) use camera_terms::{moved, shares_lens};
+pub(crate) use camera_terms::{drift_share, moved, shares_lens};
 pub use options::SplatOptions;
 pub use trainer::SplatTrainer;
 pub use trials::{CameraChoice, Candidate, CountChoice, Trial};

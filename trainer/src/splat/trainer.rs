@@ -254,13 +254,14 @@ impl SplatTrainer {
         if !set.any() {
             return Ok(self.loaded_fixes.clone());
         }
-        self.cameras.fixes(&self.gpu, set, terms)
+        self.cameras.fixes(&self.gpu, set, terms, self.scene_size_m)
     }
 
     /// The camera of a keyframe as it is learned now, with what is being tried.
     fn learned_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {
         let (set, terms) = (self.cameras.set, &self.cameras.terms);
-        let fixes = if set.any() { self.cameras.fixes(&self.gpu, set, terms)? } else { BTreeMap::new() };
+        let fixes =
+            if set.any() { self.cameras.fixes(&self.gpu, set, terms, self.scene_size_m)? } else { BTreeMap::new() };
         Ok(fixed(&fixes, keyframe))
     }
 
