@@ -115,7 +115,7 @@ pub struct CameraFix {
     pub readout_secs: f64,
     /// Turn and shift of the images learned from, by stamp in nanoseconds: between two of them poses drift evenly.
     pub drift: BTreeMap<i64, [f64; 6]>,
-    /// How much of the drift between them holds for images that are not among them, 0 to 1; see [`drift_share`].
+    /// How much of the drift between them holds for images that are not among them, 0 to 1.
     pub drift_share: f64,
     /// Logarithms of the gains of red, green and blue of the images learned from, likewise.
     pub log_gains: BTreeMap<i64, [f64; 3]>,
