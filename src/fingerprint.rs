@@ -1,16 +1,15 @@
 //! What of a keyframe reaches a model, as one number: data that give another one give another model.
 
+use kinematics::Twist;
 use trainer::{DepthMap, Keyframe};
 
-/// A fingerprint of pixels, depth, lens, pose and velocity; the split and what only a simulator knows are left out.
+/// A fingerprint of pixels, depth, lens, pose, velocity and how joints move it; the split and what only a simulator knows are left out.
 pub(crate) fn of(keyframe: &Keyframe) -> u64 {
     let mut hash = Hash::default();
     hash.sizes(keyframe.size_px, keyframe.focal_px, keyframe.principal_px);
     hash.pose(&keyframe.world_from_camera);
     hash.number(keyframe.readout_secs);
-    if let Some(twist) = &keyframe.twist {
-        twist.linear_m_s.iter().chain(twist.angular_rad_s.iter()).for_each(|number| hash.number(*number));
-    }
+    keyframe.twist.iter().chain(keyframe.joint_twists.iter()).for_each(|twist| hash.twist(twist));
     hash.bytes(&keyframe.rgba_srgb);
     if let Some(DepthMap { size_px, focal_px, principal_px, depth_m, world_from_camera }) = &keyframe.depth {
         hash.sizes(*size_px, *focal_px, *principal_px);
@@ -51,6 +50,10 @@ impl Hash {
         focal_px.into_iter().chain(principal_px).for_each(|number| self.number(number));
     }
 
+    fn twist(&mut self, twist: &Twist) {
+        twist.linear_m_s.iter().chain(twist.angular_rad_s.iter()).for_each(|number| self.number(*number));
+    }
+
     fn pose(&mut self, pose: &kinematics::Transform) {
         let numbers = pose.translation.vector.iter().chain(pose.rotation.coords.iter());
         numbers.for_each(|number| self.number(*number));
@@ -60,7 +63,7 @@ impl Hash {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use kinematics::{Stamp, Transform, Twist};
+    use kinematics::{Stamp, Transform};
     use trainer::Split;
 
     fn keyframe() -> Keyframe {
@@ -92,12 +95,13 @@ mod tests {
     fn whatever_reaches_a_model_changes_it() {
         let same = of(&keyframe());
         assert_eq!(of(&Keyframe { split: Split::Test, ..keyframe() }), same);
-        let changes: [fn(&mut Keyframe); 9] = [
+        let changes: [fn(&mut Keyframe); 10] = [
             |keyframe| keyframe.rgba_srgb = (1..13).collect(),
             |keyframe| keyframe.rgba_srgb = (0..11).chain([12]).collect(),
             |keyframe| keyframe.world_from_camera = Transform::translation(1.0, 2.0, 3.0 + 1e-15),
             |keyframe| keyframe.focal_px[1] = 5.0,
             |keyframe| keyframe.twist = None,
+            |keyframe| keyframe.joint_twists = [Twist::zero()].into(),
             |keyframe| keyframe.readout_secs = 0.0,
             |keyframe| keyframe.depth = None,
             |keyframe| keyframe.depth.as_mut().expect("depth").depth_m = vec![1.0, 2.5].into(),

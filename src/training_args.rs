@@ -4,6 +4,7 @@ use crate::config::{MAX_BYTES, MAX_SPLATS, Override, SEED};
 use crate::exit::BadArgument;
 use crate::method::Kind;
 use clap::value_parser;
+use trainer::align;
 use trainer::splat::{CameraChoice, CountChoice, TermSet};
 
 /// What to train, and how large it may become.
@@ -145,31 +146,17 @@ impl TrainingArgs {
 impl Evidence {
     /// Candidates, the likelier first: alignment for what it can do, a trial with the scene for the rest.
     fn what_pays(self) -> Refining {
-        let one = |change: fn(&mut TermSet)| {
-            let mut set = TermSet::default();
-            change(&mut set);
-            set
-        };
-        let [gains, poses] = [one(|set| set.image_gains = true), one(|set| set.image_poses = true)];
-        let align = vec![
-            one(|set| set.mount = true),
-            one(|set| set.delay = true),
-            one(|set| set.joints = true),
-            one(|set| set.depth_pose = true),
-            one(|set| set.lens = true),
-            one(|set| set.depth_scale = true),
-            one(|set| set.readout = true),
-            poses,
-        ];
+        let gains = TermSet { image_gains: true, ..TermSet::NONE };
+        let poses = TermSet { image_poses: true, ..TermSet::NONE };
         let learn = match self {
             Self { joints: true, depth: true } => vec![gains],
             Self { joints: true, depth: false } => {
-                vec![gains, TermSet { mount: true, delay: true, ..TermSet::default() }]
+                vec![gains, TermSet { mount: true, delay: true, ..TermSet::NONE }]
             }
             Self { joints: false, .. } => vec![gains, poses],
         };
         Refining {
-            align: CameraChoice::Try(if self.depth { align } else { Vec::new() }),
+            align: CameraChoice::Try(if self.depth { align::candidates() } else { Vec::new() }),
             learn: CameraChoice::Try(learn),
         }
     }
@@ -178,18 +165,6 @@ impl Evidence {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    const NOTHING: TermSet = TermSet {
-        mount: false,
-        delay: false,
-        lens: false,
-        image_poses: false,
-        image_gains: false,
-        joints: false,
-        depth_pose: false,
-        depth_scale: false,
-        readout: false,
-    };
 
     fn refining(asked: &[Refine], joints: bool, depth: bool) -> Result<Refining, String> {
         let args = TrainingArgs {
@@ -205,10 +180,10 @@ mod tests {
 
     #[test]
     fn what_depth_can_tell_is_not_learned_with_the_scene() {
-        let mount = TermSet { mount: true, ..NOTHING };
+        let mount = TermSet { mount: true, ..TermSet::NONE };
         let by_depth = refining(&[Refine::Mount, Refine::ImageGains], true, true).unwrap();
         assert_eq!(by_depth.align, CameraChoice::Given(mount));
-        assert_eq!(by_depth.learn, CameraChoice::Given(TermSet { image_gains: true, ..NOTHING }));
+        assert_eq!(by_depth.learn, CameraChoice::Given(TermSet { image_gains: true, ..TermSet::NONE }));
         let without = refining(&[Refine::Mount], true, false).unwrap();
         assert_eq!(without, Refining { align: CameraChoice::default(), learn: CameraChoice::Given(mount) });
 

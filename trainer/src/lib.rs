@@ -16,6 +16,8 @@ pub mod request;
 pub mod sort;
 pub mod splat;
 pub mod spz;
+#[cfg(test)]
+mod test_data;
 
 pub use error::Error;
 pub use keyframe::{DepthMap, Keyframe, Split, Truth};

@@ -58,6 +58,20 @@ struct Scene {
     judging: Vec<Pair>,
 }
 
+/// What alignment can find, the likelier first.
+pub fn candidates() -> Vec<TermSet> {
+    vec![
+        TermSet { mount: true, ..TermSet::NONE },
+        TermSet { delay: true, ..TermSet::NONE },
+        TermSet { joints: true, ..TermSet::NONE },
+        TermSet { depth_pose: true, ..TermSet::NONE },
+        TermSet { lens: true, ..TermSet::NONE },
+        TermSet { depth_scale: true, ..TermSet::NONE },
+        TermSet { readout: true, ..TermSet::NONE },
+        TermSet { image_poses: true, ..TermSet::NONE },
+    ]
+}
+
 /// Finds what is asked for; none where keyframes have no depth, or too few of them see the same.
 ///
 /// Only keyframes for training are learned from, selection keyframes judge, test keyframes are not looked at.
@@ -132,7 +146,7 @@ impl Scene {
             fit = Some(found);
         }
         if set.image_poses {
-            (corrections, _) = poses::fit(&self.frames, &self.all_pairs, &corrections)?;
+            corrections = poses::fit(&self.frames, &self.all_pairs, &corrections)?;
         }
         Some(Model { set, fit, corrections })
     }

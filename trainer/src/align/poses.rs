@@ -7,7 +7,7 @@ use super::layout::Layout;
 use super::pairs::Pair;
 use super::residual::Side;
 use super::solve::INFLATION;
-use super::sums::{self, Looks, Noise, PairSums, Part};
+use super::sums::{self, Looks, PairSums, Part};
 use super::view::View;
 use crate::splat::{CameraFix, drift_share, moved};
 use kinematics::{Twist, transform};
@@ -24,7 +24,7 @@ const LONGEST_STEP: f64 = 2.0;
 /// far as drift was found.
 ///
 /// How far poses are off is learned from the poses themselves, level by level: where all are nearly right, noise moves none.
-pub(super) fn fit(frames: &[Frame], pairs: &[Pair], from: &Corrections) -> Option<(Corrections, Noise)> {
+pub(super) fn fit(frames: &[Frame], pairs: &[Pair], from: &Corrections) -> Option<Corrections> {
     let layout = Layout::default();
     let mut corrections = from.clone();
     let tied: BTreeMap<usize, usize> = {
@@ -68,7 +68,7 @@ pub(super) fn fit(frames: &[Frame], pairs: &[Pair], from: &Corrections) -> Optio
     for fix in &mut corrections.fixes {
         fix.drift_share = drift_share(&fix.drift, depth_m);
     }
-    Some((corrections, how.noise))
+    Some(corrections)
 }
 
 /// Finds the pose of one image by others that stay, `pairs` all being to it, on a part of its pixels: its camera's fix with

@@ -199,24 +199,6 @@ pub(crate) fn capture(wrong: &Wrong) -> Vec<Arc<Keyframe>> {
     (0..N_IMAGES).into_par_iter().map(image).collect()
 }
 
-fn all() -> Vec<TermSet> {
-    let one = |change: fn(&mut TermSet)| {
-        let mut set = TermSet::default();
-        change(&mut set);
-        set
-    };
-    vec![
-        one(|set| set.mount = true),
-        one(|set| set.delay = true),
-        one(|set| set.joints = true),
-        one(|set| set.depth_pose = true),
-        one(|set| set.lens = true),
-        one(|set| set.depth_scale = true),
-        one(|set| set.readout = true),
-        one(|set| set.image_poses = true),
-    ]
-}
-
 fn given(wrong: &Wrong, change: fn(&mut TermSet)) -> Alignment {
     let mut set = TermSet::default();
     change(&mut set);
@@ -224,7 +206,7 @@ fn given(wrong: &Wrong, change: fn(&mut TermSet)) -> Alignment {
 }
 
 fn tried(wrong: &Wrong) -> Alignment {
-    align(&capture(wrong), &CameraChoice::Try(all())).unwrap()
+    align(&capture(wrong), &CameraChoice::Try(candidates())).unwrap()
 }
 
 pub(crate) fn wrong_mount() -> Transform {
@@ -375,7 +357,7 @@ fn worst_slopes(rolls: bool) -> Vec<(layout::Term, f64, f64)> {
     let wrong = Wrong { noise: 0.0, rolls, ..Wrong::nothing() };
     let mut scene = Scene::new(&capture(&wrong), false).unwrap();
     scene.frames.iter_mut().for_each(evenly_lit);
-    let all = all().into_iter().fold(TermSet::default(), TermSet::and);
+    let all = candidates().into_iter().fold(TermSet::default(), TermSet::and);
     let layout = Layout::new(all, &scene.frames, 1);
     let mut here = Corrections::none(1);
     // Joints start at zero: their columns are those of the joints as read, to first order.
@@ -449,7 +431,7 @@ fn slopes_match_central_differences() {
 #[test]
 fn keyframes_without_depth_and_lone_ones_align_nothing() {
     let keyframes = capture(&Wrong::nothing());
-    let choice = CameraChoice::Try(all());
+    let choice = CameraChoice::Try(candidates());
     assert_eq!(align(&[], &choice), None);
     assert_eq!(align(&keyframes[..2], &choice), None);
     let flat = |keyframe: &Arc<Keyframe>| Arc::new(Keyframe { depth: None, ..keyframe.as_ref().clone() });
@@ -485,7 +467,7 @@ fn drifting_images_are_moved_where_that_pays() {
             Arc::new(moved)
         })
         .collect();
-    let alignment = align(&keyframes, &CameraChoice::Try(all())).unwrap();
+    let alignment = align(&keyframes, &CameraChoice::Try(candidates())).unwrap();
     let trial = alignment.trials.last().unwrap();
     let has_poses = matches!(trial.candidate, Candidate::Cameras(terms) if terms.image_poses);
     assert!(has_poses && trial.kept && trial.gain_db > 3.0, "{:?}", alignment.lines());
@@ -545,7 +527,7 @@ fn images_that_err_on_their_own_are_moved_and_test_images_are_not() {
         [(2.0, 0.3, 0.02, false), (5.0, 0.3, 0.02, true), (10.0, 1.5, 0.2, true)]
     {
         let keyframes = noisy(mm, from_joints);
-        let alignment = align(&keyframes, &CameraChoice::Try(all())).unwrap();
+        let alignment = align(&keyframes, &CameraChoice::Try(candidates())).unwrap();
         assert!(alignment.has_image_poses(), "{mm} mm: {:?}", alignment.lines());
         let fix = &alignment.fixes["wrist"];
         let left = |split: Split| {

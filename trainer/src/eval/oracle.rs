@@ -2,7 +2,7 @@
 
 use super::{Lpips, PixelPair, psnr, ssim};
 use serde_json::Value;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Both sides compute the same integers.
 const PSNR_TOLERANCE_DB: f64 = 1e-6;
@@ -10,16 +10,6 @@ const PSNR_TOLERANCE_DB: f64 = 1e-6;
 const SSIM_TOLERANCE: f64 = 1e-4;
 /// Different summation order through 26 convolutions in f32.
 const LPIPS_TOLERANCE: f64 = 1e-4;
-
-fn metrics_folder() -> Option<PathBuf> {
-    let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
-    let folder = std::env::var_os("FIELDRIG_TEST_DATA").map_or_else(beside, PathBuf::from).join("metrics");
-    if !folder.is_dir() {
-        eprintln!("skipped: no test data at {}", folder.display());
-        return None;
-    }
-    Some(folder)
-}
 
 struct Picture {
     size_px: [u32; 2],
@@ -48,7 +38,7 @@ fn agrees(what: &str, got: f64, expected: f64, tolerance: f64) -> bool {
 
 #[test]
 fn metrics_agree_with_the_oracle() {
-    let Some(folder) = metrics_folder() else { return };
+    let Some(folder) = crate::test_data::folder("metrics") else { return };
     let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
     let rows = json(&folder.join("oracle_metrics.json"));
     let mut good = true;
@@ -67,7 +57,7 @@ fn metrics_agree_with_the_oracle() {
 
 #[test]
 fn lpips_agrees_pair_by_pair_and_is_zero_for_equal_pictures() {
-    let Some(folder) = metrics_folder() else { return };
+    let Some(folder) = crate::test_data::folder("metrics") else { return };
     let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
     for (names, row) in json(&folder.join("oracle_lpips_squeeze_ex.json")).as_object().unwrap() {
         let (a, b) = names.split_once('|').unwrap();
@@ -80,7 +70,7 @@ fn lpips_agrees_pair_by_pair_and_is_zero_for_equal_pictures() {
 
 #[test]
 fn a_slightly_wrong_picture_does_not_agree() {
-    let Some(folder) = metrics_folder() else { return };
+    let Some(folder) = crate::test_data::folder("metrics") else { return };
     let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
     let (a, b) = (picture(&folder, "fox_a.png"), picture(&folder, "fox_b_noise.png"));
     // One level brighter everywhere: hardly visible, yet every metric must notice.
@@ -95,7 +85,7 @@ fn a_slightly_wrong_picture_does_not_agree() {
 
 #[test]
 fn lpips_leaves_masked_pixels_out_and_refuses_small_pictures() {
-    let Some(folder) = metrics_folder() else { return };
+    let Some(folder) = crate::test_data::folder("metrics") else { return };
     let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
     let (a, mut b) = (picture(&folder, "fox_a.png"), picture(&folder, "fox_a.png"));
     for pixel in b.rgba.chunks_exact_mut(4).take(5000) {

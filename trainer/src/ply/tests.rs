@@ -84,13 +84,7 @@ fn broken_files_are_refused_with_the_reason() {
 
 #[test]
 fn packed_files_of_another_program_are_read() {
-    let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
-    let data = std::env::var_os("FIELDRIG_TEST_DATA").map_or_else(beside, std::path::PathBuf::from);
-    let folder = data.join("splats");
-    if !folder.is_dir() {
-        eprintln!("skipped: no test data at {}", folder.display());
-        return;
-    }
+    let Some(folder) = crate::test_data::folder("splats") else { return };
     let small = read(&folder.join("test.ply")).unwrap();
     assert_eq!((small.n_splats(), small.sh_degree), (64, 3));
     // The bounds are those of the file's only chunk.

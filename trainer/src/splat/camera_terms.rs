@@ -39,9 +39,22 @@ pub struct TermSet {
 }
 
 impl TermSet {
+    /// Nothing is learned.
+    pub const NONE: Self = Self {
+        mount: false,
+        delay: false,
+        lens: false,
+        image_poses: false,
+        image_gains: false,
+        joints: false,
+        depth_pose: false,
+        depth_scale: false,
+        readout: false,
+    };
+
     /// Whether anything is learned.
     pub fn any(self) -> bool {
-        self != Self::default()
+        self != Self::NONE
     }
 
     /// All of both.

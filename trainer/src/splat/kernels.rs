@@ -42,31 +42,27 @@ const SHARED: &[Source] = &[
     source!("camera_terms"),
     source!("camera_sums", "camera_sums_none"),
 ];
-/// What `update` imports where cameras are learned, too.
-const WITH_CAMERA: &[Source] = &[
-    GRADIENT_SUM,
-    VIEW,
-    STATUS,
-    MODEL,
-    PROJECTION,
-    source!("sh"),
-    GRADIENT,
-    source!("random"),
-    source!("camera_sums", "camera_sums_tree"),
-];
-
-/// What `update` imports where gradients meet unordered.
-const UPDATE_UNORDERED: &[Source] = &[
-    VIEW,
-    STATUS,
-    MODEL,
-    PROJECTION,
-    source!("sh"),
-    GRADIENT,
-    source!("gradient_sum", "gradient_sum_meeting"),
-    source!("random"),
-    source!("camera_sums", "camera_sums_none"),
-];
+/// What `update` imports.
+macro_rules! update_sources {
+    ($gradient_sum:expr, $camera_sums:literal) => {
+        &[
+            VIEW,
+            STATUS,
+            MODEL,
+            PROJECTION,
+            source!("sh"),
+            GRADIENT,
+            source!("random"),
+            $gradient_sum,
+            source!("camera_sums", $camera_sums),
+        ]
+    };
+}
+/// Where cameras are learned, too.
+const WITH_CAMERA: &[Source] = update_sources!(GRADIENT_SUM, "camera_sums_tree");
+/// Where gradients meet unordered.
+const UPDATE_UNORDERED: &[Source] =
+    update_sources!(source!("gradient_sum", "gradient_sum_meeting"), "camera_sums_none");
 
 /// What the kernels over pixels import.
 macro_rules! blend_sources {

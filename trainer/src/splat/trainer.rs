@@ -15,7 +15,7 @@ use super::params::{Camera, Growth, LOW_PASS_PX2, Rule, Supervision, View, statu
 use super::passes::{self, GrowthBuffers, Target, ViewPasses};
 use super::seed::{self, Density, Seeder};
 use super::trials::{CameraChoice, Candidate, Due, HeldBack, Now, Trial, Trials};
-use super::views::{LevelImages, TrainView};
+use super::views::{Level, LevelImages, Order, TrainView};
 use crate::align::Alignment;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
@@ -90,6 +90,7 @@ pub struct SplatTrainer {
     seeds_per_image: f64,
     coarse_steps: [u64; 2],
     views: Vec<TrainView>,
+    order: Order,
     scene_size_m: f64,
     has_depth: bool,
     step: u64,
@@ -141,6 +142,14 @@ pub(crate) struct State {
     pub(super) cameras: (TermSet, Buffer),
     pub(super) step: u64,
     pub(super) grown_at: u64,
+}
+
+/// What a step touches of the view it learns from.
+struct LearnedView<'a> {
+    view: ViewPasses<'a>,
+    level: &'a Level,
+    /// Where something is learned about its camera.
+    lens: Option<&'a Buffer>,
 }
 
 #[derive(Debug)]
@@ -203,6 +212,7 @@ impl SplatTrainer {
                 .min(f64::from(options.cap()) * SEED_SHARE),
             coarse_steps: options.coarse_steps.unwrap_or(if software { [500, 4000] } else { [150, 400] }),
             views: Vec::new(),
+            order: Order::new(options.seed),
             scene_size_m: 1.0,
             has_depth: false,
             step: 0,
@@ -257,12 +267,10 @@ impl SplatTrainer {
         self.cameras.fixes(&self.gpu, set, terms, self.scene_size_m)
     }
 
-    /// The camera of a keyframe as it is learned now, with what is being tried.
-    fn learned_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {
+    /// What is known about each camera now, with what is being tried; of keyframes that alignment has corrected already.
+    fn learned_fixes(&self) -> Result<Fixes, Error> {
         let (set, terms) = (self.cameras.set, &self.cameras.terms);
-        let fixes =
-            if set.any() { self.cameras.fixes(&self.gpu, set, terms, self.scene_size_m)? } else { BTreeMap::new() };
-        Ok(fixed(&fixes, keyframe))
+        if set.any() { self.cameras.fixes(&self.gpu, set, terms, self.scene_size_m) } else { Ok(Fixes::new()) }
     }
 
     #[cfg(test)]
@@ -420,22 +428,25 @@ impl SplatTrainer {
 
     /// Makes what the next `n` steps look at and was not looked at before, on all processors.
     fn prepare_levels(&mut self, n: u64) -> Result<(), Error> {
-        let is_there = |step| {
-            let view = &self.views[pick(step, self.views.len(), self.options.seed)];
-            view.has_level(view.clamped(level_at(step, self.coarse_steps)))
-        };
-        if (self.step..self.step + n).all(is_there) {
+        let mut wanted = self.looked_at(n);
+        if wanted.iter().all(|(view_ix, level)| self.views[*view_ix].has_level(*level)) {
             return Ok(());
         }
-        // Enough at once for all processors, and for the time of a step not to be that of its images.
-        let n = if self.gpu.is_software() { n } else { n.max(MAX_STEPS_PER_SUBMIT) };
-        let wanted: BTreeSet<(usize, usize)> = (self.step..self.step + n)
-            .map(|step| {
-                let view_ix = pick(step, self.views.len(), self.options.seed);
-                (view_ix, self.views[view_ix].clamped(level_at(step, self.coarse_steps)))
-            })
-            .collect();
+        if !self.gpu.is_software() {
+            // Enough at once for all processors, and for the time of a step not to be that of its images.
+            wanted = self.looked_at(n.max(MAX_STEPS_PER_SUBMIT));
+        }
         self.make_levels(wanted)
+    }
+
+    /// The views and levels of the next `n` steps.
+    fn looked_at(&mut self, n: u64) -> BTreeSet<(usize, usize)> {
+        let mut looked_at = BTreeSet::new();
+        for step in self.step..self.step + n {
+            let view_ix = self.order.pick(step, self.views.len());
+            looked_at.insert((view_ix, self.views[view_ix].clamped(level_at(step, self.coarse_steps))));
+        }
+        looked_at
     }
 
     /// Makes what is not there yet of these views and levels, on all processors.
@@ -454,25 +465,16 @@ impl SplatTrainer {
 
     /// Lists the passes of one step.
     fn record_step(&mut self, learn: &LearnPipelines, step: u64) -> Result<(), Error> {
-        let view_ix = pick(step, self.views.len(), self.options.seed);
-        let level_ix = level_at(step, self.coarse_steps);
-        let size_px = self.views[view_ix].level(&self.gpu, level_ix)?.size_px;
-        self.make_scratch(size_px, true)?;
-        self.make_learn_frame(size_px)?;
-        let (lens, level) = self.views[view_ix].lens_and_level(&self.gpu, level_ix)?;
-        let lens = lens.filter(|_| self.cameras.set.any());
-        let (Some((_, scratch)), Some(frame)) = (&self.scratch, &self.learn_frame) else {
-            return Err(Error::DeviceLost);
-        };
-        let view = ViewPasses {
-            gpu: &self.gpu,
-            splats: &self.splats,
-            scratch,
-            frame,
-            status: &self.learn_status,
-            view: if lens.is_some() { &self.cameras.corrected } else { &level.view },
-            size_px,
-        };
+        let view_ix = self.order.pick(step, self.views.len());
+        let level_ix = self.make_ready(view_ix, level_at(step, self.coarse_steps))?;
+        let mut list = std::mem::take(&mut self.passes);
+        let listed = self.list_step(&mut list, learn, (view_ix, level_ix));
+        self.passes = list;
+        listed
+    }
+
+    fn list_step(&self, list: &mut Passes, learn: &LearnPipelines, place: (usize, usize)) -> Result<(), Error> {
+        let LearnedView { view, level, lens } = self.learned_view(list, learn, place)?;
         let target = Target {
             image: &level.image,
             depth: &level.depth,
@@ -480,20 +482,52 @@ impl SplatTrainer {
             gains: &self.cameras.gains,
             ssim: self.options.dssim_frac > 0.0,
         };
+        view.draw(list, &self.draw);
+        view.compare(list, learn, &target);
+        view.backward(list, learn);
         if let Some(lens) = lens {
-            self.cameras.correct(&self.gpu, &mut self.passes, learn, &level.view, lens);
-        }
-        view.draw(&mut self.passes, &self.draw);
-        view.compare(&mut self.passes, learn, &target);
-        view.backward(&mut self.passes, learn);
-        if let Some(lens) = lens {
-            view.update(&mut self.passes, &learn.update_with_camera, &self.rule, true);
-            self.cameras.refine(&view, &mut self.passes, learn, lens);
+            view.update(list, &learn.update_with_camera, &self.rule, true);
+            self.cameras.refine(&view, list, learn, lens);
         } else {
-            view.update(&mut self.passes, &learn.update, &self.rule, false);
+            view.update(list, &learn.update, &self.rule, false);
         }
-        self.passes.dispatch(&self.gpu, &learn.advance, 1, &[("status", &self.learn_status)]);
+        list.dispatch(&self.gpu, &learn.advance, 1, &[("status", &self.learn_status)]);
         Ok(())
+    }
+
+    /// Makes all that a view needs to be learned from, `2^level` times smaller or as small as it gets; says how small.
+    fn make_ready(&mut self, view_ix: usize, level: u32) -> Result<usize, Error> {
+        let size_px = self.views[view_ix].level(&self.gpu, level)?.size_px;
+        self.make_scratch(size_px, true)?;
+        ensure_frame(&self.gpu, &mut self.learn_frame, &mut self.passes, size_px, true)?;
+        Ok(self.views[view_ix].clamped(level))
+    }
+
+    /// A view and level that are ready, with its camera as it is learned now; lists what that takes.
+    fn learned_view(
+        &self,
+        list: &mut Passes,
+        learn: &LearnPipelines,
+        (view_ix, level_ix): (usize, usize),
+    ) -> Result<LearnedView<'_>, Error> {
+        let (lens, level) = self.views[view_ix].made(level_ix)?;
+        let lens = lens.filter(|_| self.cameras.set.any());
+        let (Some((_, scratch)), Some(frame)) = (&self.scratch, &self.learn_frame) else {
+            return Err(Error::DeviceLost);
+        };
+        if let Some(lens) = lens {
+            self.cameras.correct(&self.gpu, list, learn, &level.view, lens);
+        }
+        let view = ViewPasses {
+            gpu: &self.gpu,
+            splats: &self.splats,
+            scratch,
+            frame,
+            status: &self.learn_status,
+            view: if lens.is_some() { &self.cameras.corrected } else { &level.view },
+            size_px: level.size_px,
+        };
+        Ok(LearnedView { view, level, lens })
     }
 
     /// Makes sure that a view of this size can be drawn, or learned from.
@@ -502,10 +536,6 @@ impl SplatTrainer {
         let n_entries = (2 * n_splats).max(1 << 14);
         let n_slots = if learn { 2 * n_entries } else { 0 };
         self.ensure_scratch(ScratchSize { n_splats, n_entries, n_slots, n_bins: n_bins(size_px) })
-    }
-
-    fn make_learn_frame(&mut self, size_px: [u32; 2]) -> Result<(), Error> {
-        ensure_frame(&self.gpu, &mut self.learn_frame, &mut self.passes, size_px, true)
     }
 
     fn ensure_scratch(&mut self, need: ScratchSize) -> Result<(), Error> {
@@ -906,8 +936,11 @@ impl Method for SplatTrainer {
     }
 }
 
+/// What was learned about cameras, by name.
+type Fixes = BTreeMap<String, CameraFix>;
+
 /// The camera of a keyframe as it is, where the input has it as [`PosedLens::of`].
-fn fixed(fixes: &BTreeMap<String, CameraFix>, keyframe: &Keyframe) -> PosedLens {
+fn fixed(fixes: &Fixes, keyframe: &Keyframe) -> PosedLens {
     fixes.get(keyframe.camera.as_ref()).map_or_else(|| PosedLens::of(keyframe), |fix| fix.apply(keyframe))
 }
 
@@ -954,19 +987,6 @@ fn level_at(step: u64, coarse_steps: [u64; 2]) -> u32 {
         step if step < coarse_steps[1] => 1,
         _ => 0,
     }
-}
-
-/// Which view a step learns from: every view once in a shuffled order, then again in another.
-fn pick(step: u64, n_views: usize, seed: u64) -> usize {
-    let n = n_views as u64;
-    let (round, place) = (step / n, step % n);
-    let mut order: Vec<usize> = (0..n_views).collect();
-    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ round.wrapping_mul(0xd134_2543_de82_ef95);
-    for at in (1..n_views).rev() {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        order.swap(at, ((state >> 33) % (at as u64 + 1)) as usize);
-    }
-    order[place as usize]
 }
 
 /// `n` of the splats, evenly over their list.

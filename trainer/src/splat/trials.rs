@@ -31,17 +31,7 @@ const LEAST_IMAGES: usize = 4;
 const FEWEST_SPLATS: u32 = 1000;
 
 /// Gains of images: what they bring is told by a sum over pixels, without learning them first.
-const GAINS: TermSet = TermSet {
-    mount: false,
-    delay: false,
-    lens: false,
-    image_poses: false,
-    image_gains: true,
-    joints: false,
-    depth_pose: false,
-    depth_scale: false,
-    readout: false,
-};
+const GAINS: TermSet = TermSet { image_gains: true, ..TermSet::NONE };
 
 /// What is learned about cameras.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]

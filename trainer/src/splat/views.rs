@@ -26,6 +26,40 @@ pub(crate) struct TrainView {
     lens: Option<Buffer>,
 }
 
+/// Which view a step learns from: every view once in a shuffled order, then again in another.
+#[derive(Debug)]
+pub(crate) struct Order {
+    seed: u64,
+    round: u64,
+    /// Of `round`.
+    order: Vec<usize>,
+}
+
+impl Order {
+    pub(crate) fn new(seed: u64) -> Self {
+        Self { seed, round: 0, order: Vec::new() }
+    }
+
+    pub(crate) fn pick(&mut self, step: u64, n_views: usize) -> usize {
+        let n = n_views as u64;
+        if self.order.len() != n_views || self.round != step / n {
+            self.round = step / n;
+            self.order = shuffled(self.round, n_views, self.seed);
+        }
+        self.order[(step % n) as usize]
+    }
+}
+
+fn shuffled(round: u64, n_views: usize, seed: u64) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..n_views).collect();
+    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ round.wrapping_mul(0xd134_2543_de82_ef95);
+    for at in (1..n_views).rev() {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        order.swap(at, ((state >> 33) % (at as u64 + 1)) as usize);
+    }
+    order
+}
+
 /// One keyframe at one resolution.
 #[derive(Debug)]
 pub(crate) struct Level {
@@ -50,12 +84,9 @@ impl TrainView {
         Ok(())
     }
 
-    /// The lens, where it has one, and the level; see [`TrainView::level`].
-    pub(crate) fn lens_and_level(&mut self, gpu: &Gpu, level: u32) -> Result<(Option<&Buffer>, &Level), Error> {
-        self.level(gpu, level)?;
-        let level = self.clamped(level);
-        let made = self.levels[level].as_ref().ok_or(Error::DeviceLost)?;
-        Ok((self.lens.as_ref(), made))
+    /// The lens, where it has one, and a level that was made.
+    pub(crate) fn made(&self, level: usize) -> Result<(Option<&Buffer>, &Level), Error> {
+        Ok((self.lens.as_ref(), self.levels[level].as_ref().ok_or(Error::DeviceLost)?))
     }
 
     /// No side of an image gets smaller than a tile's.

@@ -194,13 +194,7 @@ fn what_cannot_be_written_is_told() {
 
 #[test]
 fn files_of_another_program_are_read() {
-    let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
-    let data = std::env::var_os("FIELDRIG_TEST_DATA").map_or_else(beside, std::path::PathBuf::from);
-    let folder = data.join("splats");
-    if !folder.is_dir() {
-        eprintln!("skipped: no test data at {}", folder.display());
-        return;
-    }
+    let Some(folder) = crate::test_data::folder("splats") else { return };
     for name in ["minimal-v2.spz", "minimal-v3.spz"] {
         let splats = read(&folder.join(name)).unwrap();
         assert_eq!((splats.n_splats(), splats.sh_degree), (4, 0), "{name}");

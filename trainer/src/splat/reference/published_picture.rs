@@ -5,7 +5,6 @@ use crate::mismatches::Mismatches;
 use kinematics::Transform;
 use nalgebra::Vector3;
 use safetensors::SafeTensors;
-use std::path::PathBuf;
 
 /// The picture was computed in f32; its largest differences are a quarter of these. A splat's faint edge that fell the
 /// other way (alpha 1/255) would be a thousand times as large.
@@ -14,15 +13,8 @@ const REL: f64 = 1e-5;
 
 #[test]
 fn agrees_with_a_published_picture() {
-    let folder = std::env::var("FIELDRIG_TEST_DATA")
-        .map_or_else(|_| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data")), PathBuf::from);
-    let Ok(bytes) = std::fs::read(folder.join("splats/brush_tiny_case.safetensors")) else {
-        #[expect(clippy::print_stdout, reason = "says which test was skipped")]
-        {
-            println!("skipped: no test data in {}", folder.display());
-        }
-        return;
-    };
+    let Some(folder) = crate::test_data::folder("splats") else { return };
+    let bytes = std::fs::read(folder.join("brush_tiny_case.safetensors")).expect("the data hold it");
     let tensors = SafeTensors::deserialize(&bytes).expect("a valid file");
     let floats = |name: &str| -> Vec<f64> {
         let data = tensors.tensor(name).expect("the tensor is there").data();

@@ -1,6 +1,6 @@
 //! How the model as it learns does on images that it has not learned from.
 
-use super::{Learn, SplatTrainer};
+use super::{Fixes, Learn, SplatTrainer, fixed};
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 use crate::splat::buffers::Frame;
 use crate::splat::camera_terms::between;
@@ -57,12 +57,13 @@ impl SplatTrainer {
     /// whether gains are learned.
     pub(super) fn try_gains(&mut self) -> Result<(), Error> {
         let held_back = self.compare_held_back()?;
+        let fixes = self.learned_fixes()?;
         let neighbors: Vec<Vec<usize>> = held_back.iter().map(|(keyframe, _)| self.neighbors(keyframe)).collect();
         self.make_levels(neighbors.iter().flatten().map(|view_ix| (*view_ix, 0)).collect())?;
         let mut known: BTreeMap<usize, [f64; 3]> = BTreeMap::new();
         for view_ix in neighbors.iter().flatten() {
             if !known.contains_key(view_ix) {
-                known.insert(*view_ix, self.gains_of(*view_ix)?);
+                known.insert(*view_ix, self.gains_of(*view_ix, &fixes)?);
             }
         }
         // What all images ask for is the brightness of the model, not of an image.
@@ -87,7 +88,7 @@ impl SplatTrainer {
             for view_ix in 0..self.views.len() {
                 let gains = match known.get(&view_ix) {
                     Some(gains) => *gains,
-                    None => self.gains_of(view_ix)?,
+                    None => self.gains_of(view_ix, &fixes)?,
                 };
                 let keyframe = &self.views[view_ix].keyframe;
                 self.cameras.begin_gains(&self.gpu, keyframe, [0, 1, 2].map(|color| gains[color] - mean[color]));
@@ -106,20 +107,21 @@ impl SplatTrainer {
         before.into_iter().chain(after).map(|(ix, _)| ix).collect()
     }
 
-    fn gains_of(&mut self, view_ix: usize) -> Result<[f64; 3], Error> {
+    fn gains_of(&mut self, view_ix: usize, fixes: &Fixes) -> Result<[f64; 3], Error> {
         let keyframe = self.views[view_ix].keyframe.clone();
-        self.draw_keyframe(&keyframe)?;
+        self.draw_keyframe(&keyframe, fixes)?;
         let image = &self.views[view_ix].level(&self.gpu, 0)?.image;
         let drawn = Drawn::of(&self.gpu, &self.learn, &self.draw_frame, &self.draw_view)?;
         Ok(log_gains(&drawn.compare(&mut self.passes, &keyframe, image)?))
     }
 
     fn compare_held_back(&mut self) -> Result<Vec<Compared>, Error> {
+        let fixes = self.learned_fixes()?;
         let stride = self.trials.held_back.len().div_ceil(MOST_SCORED).max(1);
         let mut compared = Vec::new();
         for ix in (0..self.trials.held_back.len()).step_by(stride) {
             let keyframe = self.trials.held_back[ix].keyframe.clone();
-            self.draw_keyframe(&keyframe)?;
+            self.draw_keyframe(&keyframe, &fixes)?;
             let image = match self.trials.held_back[ix].image.take() {
                 Some(image) => image,
                 None => self.gpu.storage_with("splat.held_back", &keyframe.rgba_srgb)?,
@@ -133,8 +135,8 @@ impl SplatTrainer {
     }
 
     /// Draws the model as it learns where a keyframe was taken.
-    fn draw_keyframe(&mut self, keyframe: &Keyframe) -> Result<(), Error> {
-        let lens = self.learned_lens(keyframe)?;
+    fn draw_keyframe(&mut self, keyframe: &Keyframe, fixes: &Fixes) -> Result<(), Error> {
+        let lens = fixed(fixes, keyframe);
         let camera = Camera {
             world_from_camera: lens.world_from_camera,
             focal_px: lens.focal_px,
@@ -192,10 +194,10 @@ mod tests {
     use crate::splat::{CameraChoice, SplatOptions, TermSet};
     use crate::{Method, Split};
 
-    const GAINS: fn() -> TermSet = || TermSet { image_gains: true, ..TermSet::default() };
+    const GAINS: TermSet = TermSet { image_gains: true, ..TermSet::NONE };
 
     fn trained(keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, n_steps: u64) -> SplatTrainer {
-        let options = SplatOptions { cameras: CameraChoice::Try(vec![GAINS()]), n_planned_steps: 1000, ..options() };
+        let options = SplatOptions { cameras: CameraChoice::Try(vec![GAINS]), n_planned_steps: 1000, ..options() };
         let mut trainer = SplatTrainer::new(gpu, options).unwrap();
         for keyframe in keyframes {
             trainer.push(keyframe.clone()).unwrap();

@@ -1,12 +1,10 @@
 //! How large the model has to be: what each splat contributes, what remains without the least of them, what colors need.
 
-use super::SplatTrainer;
+use super::{LearnedView, SplatTrainer};
 use crate::Error;
-use crate::gpu::Buffer;
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::kernels::LearnPipelines;
 use crate::splat::params::{Gathering, status};
-use crate::splat::passes::ViewPasses;
 
 /// Most views that tell what a splat contributes.
 const MOST_VIEWS: usize = 64;
@@ -16,53 +14,34 @@ impl SplatTrainer {
     pub(super) fn contributions(&mut self, learn: &LearnPipelines) -> Result<Vec<f32>, Error> {
         let contributions = self.gpu.storage("splat.contributions", 4 * u64::from(self.splats.n_splats))?;
         let stride = self.views.len().div_ceil(MOST_VIEWS).max(1);
-        for view_ix in (0..self.views.len()).step_by(stride) {
+        let some: Vec<usize> = (0..self.views.len()).step_by(stride).collect();
+        self.make_levels(some.iter().map(|view_ix| (*view_ix, 0)).collect())?;
+        for view_ix in &some {
+            self.make_ready(*view_ix, 0)?;
+        }
+        if let Some(frame) = &self.learn_frame {
+            // An error of one in every pixel, and no slope.
+            self.gpu.write(&frame.rest, 0, bytemuck::cast_slice(&[0.0f32, 1.0].repeat(frame.n_pixels as usize)));
+            self.passes.clear(&frame.upstream);
+        }
+        for view_ix in some {
             loop {
-                self.list_contributions(learn, view_ix, &contributions)?;
-                self.passes.submit(&self.gpu);
-                let counters: Vec<u32> = self.gpu.read(&self.draw_status, status::LEN)?;
+                let mut list = std::mem::take(&mut self.passes);
+                let LearnedView { view, .. } = self.learned_view(&mut list, learn, (view_ix, 0))?;
+                view.draw(&mut list, &self.draw);
+                view.backward(&mut list, learn);
+                view.contribute(&mut list, learn, &contributions); // Nothing, where a buffer was too small.
+                list.submit(&self.gpu);
+                self.passes = list;
+                let counters: Vec<u32> = self.gpu.read(&self.learn_status, status::LEN)?;
                 if !self.mend(&counters)? {
                     break;
                 }
-                self.gpu.write(&self.draw_status, 4 * status::FAILED as u64, &[0; 12]);
+                self.gpu.write(&self.learn_status, 4 * status::FAILED as u64, &[0; 12]);
             }
         }
         self.passes.forget_bindings();
         self.gpu.read(&contributions, self.splats.n_splats as usize)
-    }
-
-    /// Lists the passes that add what the splats contribute to one view; they add nothing where a buffer is too small.
-    fn list_contributions(
-        &mut self,
-        learn: &LearnPipelines,
-        view_ix: usize,
-        contributions: &Buffer,
-    ) -> Result<(), Error> {
-        let size_px = self.views[view_ix].level(&self.gpu, 0)?.size_px;
-        self.make_scratch(size_px, true)?;
-        self.make_learn_frame(size_px)?;
-        self.tell_n();
-        let level = self.views[view_ix].level(&self.gpu, 0)?;
-        let (Some((_, scratch)), Some(frame)) = (&self.scratch, &self.learn_frame) else {
-            return Err(Error::DeviceLost);
-        };
-        let view = ViewPasses {
-            gpu: &self.gpu,
-            splats: &self.splats,
-            scratch,
-            frame,
-            status: &self.draw_status,
-            view: &level.view,
-            size_px,
-        };
-        // An error of one in every pixel, and no slope.
-        let ones = [0.0f32, 1.0].repeat((size_px[0] * size_px[1]) as usize);
-        self.gpu.write(&frame.rest, 0, bytemuck::cast_slice(&ones));
-        self.passes.clear(&frame.upstream);
-        view.draw(&mut self.passes, &self.draw);
-        view.backward(&mut self.passes, learn);
-        view.contribute(&mut self.passes, learn, contributions);
-        Ok(())
     }
 
     /// Keeps the `n_kept` splats that contribute most, in their order.
