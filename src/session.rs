@@ -32,6 +32,15 @@ pub(crate) struct Limits {
     pub(crate) steps: Option<u64>,
 }
 
+impl Limits {
+    /// How long that is, for people: `8 s`, `500 steps`.
+    pub(crate) fn in_words(self) -> String {
+        let parts =
+            [self.seconds.map(|seconds| format!("{seconds} s")), self.steps.map(|steps| format!("{steps} steps"))];
+        parts.into_iter().flatten().collect::<Vec<_>>().join(" or ")
+    }
+}
+
 /// How a session is judged.
 pub(crate) struct Evaluators {
     /// At the marks: thorough where nobody waits, quick in a live run.

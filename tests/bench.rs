@@ -1,4 +1,4 @@
-//! `fieldrig bench curve`, `budget` and `stability` as their users run them, on a scene of a few tiny photos.
+//! `fieldrig bench curve`, `budget`, `ablation` and `stability` as their users run them, on a scene of a few tiny photos.
 
 use image::RgbImage;
 use serde_json::{Value, json};
@@ -135,6 +135,27 @@ fn a_budget_tells_the_trainers_own_choice() {
     assert_chart(&folder.join("b"), "budget");
     assert_chart(&folder.join("b"), "budget-gain");
     assert_refused(folder, &["budget", ".", "--max-splats", "9"], 2, &["--max-splats", "--splats"]);
+}
+
+#[test]
+fn an_ablation_tells_what_each_part_brings() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    scene(folder);
+    let args = ["ablation", ".", "--steps", "30", "--seeds", "1", "--only", "structure,black", "--out", "a"];
+    let told = events(folder, &[&args[..], &["--json"]].concat());
+    let changes = told.last().expect("events")["findings"]["changes"].as_array().expect("changes").clone();
+    let names: Vec<&str> = changes.iter().filter_map(|change| change["name"].as_str()).collect();
+    assert_eq!(names, ["as it is", "no structure loss", "black background"]);
+    let psnrs: Vec<f64> = changes.iter().filter_map(|change| change["psnr"].as_f64()).collect();
+    assert!(
+        psnrs.len() == 3 && psnrs[1] != psnrs[0] && psnrs[2] != psnrs[0],
+        "the changes reach the trainer: {psnrs:?}"
+    );
+    assert_eq!(changes[1]["bought_db"].as_f64(), Some(psnrs[0] - psnrs[1]));
+    let page = std::fs::read_to_string(folder.join("a/ablation.html")).expect("a page");
+    assert!(page.contains("black background"), "{page}");
+    assert_refused(folder, &["ablation", ".", "--only", "nothing", "--out", "b"], 2, &["--only", "no growth"]);
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use crate::bench::page::{Findings, Table};
 use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
 use crate::bench::statistics::{db_per_doubling, extent, median};
-use crate::chart::{Axis, Chart, Line, Point, Rule, Scale, short};
+use crate::chart::{Axis, Chart, Line, Point, Rule, Scale};
 use crate::exit::{self, BadArgument, Exit};
 use crate::training;
 use serde::Serialize;
@@ -145,10 +145,7 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -
     let by_cap: Vec<&Capped> = capped.iter().filter(|capped| capped.cap.is_some()).collect();
     let own = capped.iter().find(|capped| capped.cap.is_none());
     let gains = gains(&by_cap);
-    let length = args.steps.map_or_else(
-        || format!("{} s", short(args.seconds.unwrap_or(USUAL_SECONDS))),
-        |steps| format!("{steps} steps"),
-    );
+    let length = training::limits(args.seconds, args.steps, USUAL_SECONDS)?.in_words();
     let spread = if args.seeds > 1 {
         format!("median of {} seeds, band: lowest to highest", args.seeds)
     } else {

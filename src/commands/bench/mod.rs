@@ -1,5 +1,6 @@
 //! `fieldrig bench`: how fast, how good after how long, how large for how good, and how sturdy.
 
+mod ablation;
 mod budget;
 mod curve;
 mod kernels;
@@ -23,6 +24,8 @@ enum What {
     Curve(curve::Args),
     /// PSNR of held-out images over the number of splats, and what the trainer takes by itself
     Budget(budget::Args),
+    /// What each part of the method brings, by training without it
+    Ablation(ablation::Args),
     /// PSNR of held-out images over the size of a disturbance of the training images, and where it breaks
     Stability(stability::Args),
 }
@@ -32,6 +35,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         What::Kernels(args) => kernels::run(args).map(|()| Exit::Done),
         What::Curve(args) => curve::run(args),
         What::Budget(args) => budget::run(args),
+        What::Ablation(args) => ablation::run(args),
         What::Stability(args) => stability::run(args),
     }
 }

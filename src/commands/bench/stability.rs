@@ -377,10 +377,7 @@ fn findings(
     data: &NamedData,
     envelopes: &[Envelope],
 ) -> anyhow::Result<(Findings, PathBuf)> {
-    let length = args.steps.map_or_else(
-        || format!("{} s", short(args.seconds.unwrap_or(USUAL_SECONDS))),
-        |steps| format!("{steps} steps"),
-    );
+    let length = training::limits(args.seconds, args.steps, USUAL_SECONDS)?.in_words();
     let spread = if args.seeds > 1 {
         format!("median of {} seeds, band: lowest to highest", args.seeds)
     } else {

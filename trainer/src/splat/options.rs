@@ -23,6 +23,16 @@ pub struct SplatOptions {
     pub dssim_frac: f64,
     /// Weight of the depth loss, per metre.
     pub depth_per_m: f64,
+    /// How bright the background may be that changes every step: enough to keep black things solid. Up to 1 costs 1 dB
+    /// in the first few hundred steps, while much is still bare.
+    pub varied_background: f64,
+    /// Opacity and size cost the square of this over the number of images, against the color loss: the fewer images there
+    /// are, the more must speak for a splat. 0: they cost nothing.
+    pub cost_images: f64,
+    /// Growth at each change of the splat count, as a share of it.
+    pub growth_frac: f64,
+    /// How far places wander at random, against their learning rate: the fainter a splat, the further.
+    pub noise: f64,
     /// Steps at a quarter of the resolution, and past which step the full one is used; `None`: few on a GPU, many on a
     /// processor, where a step takes as long as the image has pixels.
     pub coarse_steps: Option<[u64; 2]>,
@@ -46,6 +56,10 @@ impl Default for SplatOptions {
             n_planned_steps: 7000,
             dssim_frac: 0.2,
             depth_per_m: 0.1,
+            varied_background: 0.25,
+            cost_images: 13.0,
+            growth_frac: 0.1,
+            noise: 5e5,
             coarse_steps: None,
             cameras: CameraChoice::default(),
             align: CameraChoice::default(),

@@ -34,8 +34,6 @@ const GROWTH_PERIOD: u64 = 100;
 const GROWTH_START: u64 = 200;
 /// Share of the planned steps after which the count stays.
 const GROWTH_END_FRAC: f64 = 0.75;
-/// Growth at each change.
-const GROWTH_FRAC: f64 = 0.1;
 /// Steps between degrees of spherical harmonics.
 const SH_PERIOD: u64 = 300;
 /// GPU time a submit may hold, so that pictures and Ctrl-C get their turn.
@@ -49,15 +47,10 @@ const DEPTH_CLIP_M: f64 = 0.2;
 const SEED_SHARE: f64 = 1.0 / 8.0;
 /// Pixels of an image that a seed stands for at least: with finer ones the first steps take longer than they gain.
 const PX_PER_SEED: f64 = 48.0;
-/// How bright the background may be that changes every step: enough to keep black things solid. Up to 1 costs 1 dB
-/// in the first few hundred steps, while much is still bare.
-const VARIED_BACKGROUND: f32 = 0.25;
 /// Place of a child within its parent, in standard deviations.
 const CHILD_SPREAD: f32 = 0.5;
-/// Opacity and size cost as much against the color loss as if this many images had seen a scene without them: the fewer
-/// images there are, the more must speak for a splat.
-const COST_IMAGES: f64 = 4.0;
-const COST_RANGE: [f64; 2] = [0.01, 0.1];
+/// Most that opacity and size cost against the color loss.
+const MOST_COST: f64 = 0.1;
 
 /// 3D Gaussian splats that learn from keyframes.
 #[derive(Debug)]
@@ -188,7 +181,7 @@ impl SplatTrainer {
                     dssim_frac: f32_of(options.dssim_frac),
                     depth_weight: f32_of(options.depth_per_m),
                     depth_clip_m: f32_of(DEPTH_CLIP_M),
-                    varied_background: VARIED_BACKGROUND,
+                    varied_background: f32_of(options.varied_background),
                 },
             ),
             plain: gpu.uniform_with("splat.background", &<Supervision as bytemuck::Zeroable>::zeroed()),
@@ -399,10 +392,8 @@ impl SplatTrainer {
             self.cameras.write_rule(&self.gpu, done, self.scene_size_m);
         }
         let size = f32_of(self.scene_size_m);
-        let cost = f32_of(
-            (COST_IMAGES / self.views.len().max(1) as f64).clamp(COST_RANGE[0], COST_RANGE[1])
-                / f64::from(self.splats.n_splats.max(1)),
-        );
+        let cost = (self.options.cost_images / self.views.len().max(1) as f64).powi(2).min(MOST_COST);
+        let cost = f32_of(cost / f64::from(self.splats.n_splats.max(1)));
         let rule = Rule {
             mean_rate_m: 1.6e-4 * size,
             log_scale_rate: 5e-3,
@@ -410,7 +401,7 @@ impl SplatTrainer {
             opacity_rate: 5e-2,
             sh_dc_rate: 2.5e-3,
             sh_rest_rate: 2.5e-3 / 20.0,
-            noise: 5e5,
+            noise: f32_of(self.options.noise),
             final_mean_rate_frac: 0.01,
             betas: [0.9, 0.999],
             epsilon: 1e-15,
@@ -619,7 +610,8 @@ impl SplatTrainer {
         }
         self.grown_at = self.step;
         let n_before = self.splats.n_splats;
-        let more = if self.trials.may_grow() { (f64::from(n_before) * GROWTH_FRAC).ceil() as u32 } else { 0 };
+        let more =
+            if self.trials.may_grow() { (f64::from(n_before) * self.options.growth_frac).ceil() as u32 } else { 0 };
         let n_after = (n_before + more).min(self.options.cap()).max(n_before);
         self.make_room(n_after)?;
         let growth = Growth {
@@ -724,8 +716,6 @@ impl SplatTrainer {
     fn learn_from(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         self.settle()?;
         self.has_depth |= keyframe.depth.is_some();
-        // What comes late finds at least half of the plan ahead of it: rates that still move things, and growth.
-        self.schedule_start = self.schedule_start.max(self.step.saturating_sub(self.options.n_planned_steps / 2));
         self.pending.push(keyframe.clone());
         self.views.push(TrainView::new(keyframe));
         Ok(())
@@ -788,6 +778,8 @@ impl Method for SplatTrainer {
             self.trials.held_back.push(HeldBack { keyframe, image: None });
             return Ok(());
         }
+        // What comes late finds at least half of the plan ahead of it: rates that still move things, and growth.
+        self.schedule_start = self.schedule_start.max(self.step.saturating_sub(self.options.n_planned_steps / 2));
         self.learn_from(keyframe)
     }
 

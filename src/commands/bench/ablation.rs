@@ -1,0 +1,233 @@
+//! `fieldrig bench ablation`: what each part of the method brings, by training without it.
+
+use crate::bench::page::{Findings, Table};
+use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
+use crate::bench::statistics::{median, sample_std};
+use crate::exit::{self, BadArgument, Exit};
+use crate::training;
+use serde::Serialize;
+use std::collections::HashSet;
+use std::path::PathBuf;
+use trainer::splat::{CameraChoice, CountChoice, SplatOptions};
+
+/// Length of a run where no flag says.
+const USUAL_SECONDS: f64 = 16.0;
+/// Marks that the table tells, seconds.
+const TOLD_SECS: [f64; 2] = [1.0, 4.0];
+
+/// One change of how the trainer learns.
+struct Change {
+    name: &'static str,
+    change: fn(SplatOptions) -> SplatOptions,
+}
+
+/// What all are compared with.
+const WHOLE: Change = Change { name: "as it is", change: |options| options };
+
+const CHANGES: &[Change] = &[
+    Change { name: "cloud for seeds", change: |options| SplatOptions { seeds_per_image: Some(0.0), ..options } },
+    Change { name: "no depth loss", change: |options| SplatOptions { depth_per_m: 0.0, ..options } },
+    Change { name: "no structure loss", change: |options| SplatOptions { dssim_frac: 0.0, ..options } },
+    Change {
+        name: "full size from the start",
+        change: |options| SplatOptions { coarse_steps: Some([0; 2]), ..options },
+    },
+    Change { name: "black background", change: |options| SplatOptions { varied_background: 0.0, ..options } },
+    Change { name: "opacity and size for free", change: |options| SplatOptions { cost_images: 0.0, ..options } },
+    Change { name: "no growth", change: |options| SplatOptions { growth_frac: 0.0, ..options } },
+    Change { name: "no wandering", change: |options| SplatOptions { noise: 0.0, ..options } },
+    Change { name: "one color a splat", change: |options| SplatOptions { sh_degree: 0, ..options } },
+    Change { name: "filled up to the cap", change: |options| SplatOptions { count: CountChoice::ToCap, ..options } },
+    Change {
+        name: "cameras as given",
+        change: |options| SplatOptions { cameras: CameraChoice::default(), align: CameraChoice::default(), ..options },
+    },
+];
+
+/// Flags of `bench ablation`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// A nerfstudio or TUM RGB-D folder, or a recording (.mcap)
+    data: PathBuf,
+    /// Length of a run in seconds of training; loading and scoring do not count [default: 16, unless --steps is given]
+    #[arg(long, value_name = "S")]
+    seconds: Option<f64>,
+    /// Length of a run in optimiser steps
+    #[arg(long, value_name = "N")]
+    steps: Option<u64>,
+    /// Runs of each change, 1 to 1000, with seeds counted up from --seed
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    seeds: u64,
+    /// Only the rows whose names contain one of these words, separated by commas
+    #[arg(long, value_name = "WORD,...", value_delimiter = ',')]
+    only: Vec<String>,
+    #[command(flatten)]
+    bench: BenchArgs,
+}
+
+/// The runs of one change.
+#[derive(Debug, Serialize)]
+struct Changed {
+    name: &'static str,
+    /// Medians, dB.
+    psnr: f64,
+    ssim: Option<f64>,
+    lpips: Option<f64>,
+    depth_rmse_m: Option<f64>,
+    primitives: f64,
+    /// Median of the gains of whole over changed, seed by seed, dB.
+    bought_db: f64,
+    /// Standard deviation of them; `None` of a single seed.
+    bought_std_db: Option<f64>,
+    runs: Vec<Run>,
+}
+
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let limits = training::limits(args.seconds, args.steps, USUAL_SECONDS)?;
+    let mut runs = Runs::open(&args.bench, crate::commands::open_gpu()?)?;
+    let data = runs.load(&args.data, &mut HashSet::new())?;
+    let asked = |change: &&Change| args.only.is_empty() || args.only.iter().any(|word| change.name.contains(word));
+    let changes: Vec<&Change> =
+        CHANGES.iter().filter(|change| is_change(change, &data.options)).filter(asked).collect();
+    if changes.is_empty() {
+        let names: Vec<&str> = CHANGES.iter().map(|change| change.name).collect();
+        return Err(BadArgument(format!("--only: none of the rows is named so: {}", names.join(", "))).into());
+    }
+    if args.bench.training.count.is_some() {
+        return Err(BadArgument("--count: this bench sets it itself".into()).into());
+    }
+    runs.expect((changes.len() + 1) * usize::try_from(args.seeds)?);
+    let mut whole: Vec<Run> = Vec::new();
+    let mut rows: Vec<Changed> = Vec::new();
+    let mut page = None;
+    for change in std::iter::once(&WHOLE).chain(changes) {
+        let mut finished = Vec::new();
+        for seed in data.options.seed..data.options.seed.saturating_add(args.seeds) {
+            finished.push(runs.run(Job {
+                name: format!("ablation {} {} seed {seed}", data.name, change.name),
+                data: &data,
+                options: (change.change)(SplatOptions { seed, ..data.options.clone() }),
+                limits,
+                disturbed: None,
+                variant: Some(change.name.to_owned()),
+                keyframes: &|| data.data.keyframes.clone(),
+                is_thorough: false,
+            })?);
+        }
+        if whole.is_empty() {
+            whole = finished.clone();
+        }
+        rows.extend(Changed::of(change.name, &whole, finished));
+        page = Some(findings(args, &runs, &data, &rows)?);
+    }
+    if let Some((findings, page)) = page {
+        findings.tell(&page, args.bench.json)?;
+    }
+    Ok(exit::after(&data.data.losses))
+}
+
+/// Whether it changes anything about how these data are learned.
+fn is_change(change: &Change, options: &SplatOptions) -> bool {
+    (change.change)(options.clone()) != *options
+}
+
+impl Changed {
+    fn of(name: &'static str, whole: &[Run], runs: Vec<Run>) -> Option<Self> {
+        let middle = |of: &dyn Fn(&Run) -> Option<f64>| median(&runs.iter().filter_map(of).collect::<Vec<_>>());
+        let bought: Vec<f64> = whole.iter().zip(&runs).map(|(whole, changed)| whole.psnr() - changed.psnr()).collect();
+        Some(Self {
+            name,
+            psnr: middle(&|run| Some(run.psnr()))?,
+            ssim: middle(&|run| run.end.ssim),
+            lpips: middle(&|run| run.end.lpips),
+            depth_rmse_m: middle(&|run| run.end.depth_rmse_m),
+            primitives: middle(&|run| Some(run.end.primitives as f64))?,
+            bought_db: median(&bought)?,
+            bought_std_db: sample_std(&bought),
+            runs,
+        })
+    }
+
+    fn row(&self) -> Vec<String> {
+        let number = |value: Option<f64>, places: usize| {
+            value.map_or_else(|| "-".to_owned(), |value| format!("{value:.places$}"))
+        };
+        let at = |secs: f64| {
+            let of_run = |run: &Run| {
+                run.curve().into_iter().find(|(mark, _)| (mark / secs - 1.0).abs() < 0.1).map(|(_, psnr)| psnr)
+            };
+            number(median(&self.runs.iter().filter_map(of_run).collect::<Vec<_>>()), 2)
+        };
+        let bought = if self.name == WHOLE.name {
+            "-".to_owned()
+        } else {
+            let spread = self.bought_std_db.map_or_else(String::new, |std| format!(" (std {std:.2})"));
+            format!("{:+.2}{spread}", self.bought_db)
+        };
+        let mut row = vec![self.name.to_owned()];
+        row.extend(TOLD_SECS.map(at));
+        row.extend([
+            format!("{:.2}", self.psnr),
+            bought,
+            number(self.ssim, 4),
+            number(self.lpips, 4),
+            number(self.depth_rmse_m.map(|metres| 1e3 * metres), 1),
+            format!("{:.0}", self.primitives),
+        ]);
+        row
+    }
+}
+
+/// Everything known so far, written.
+fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, rows: &[Changed]) -> anyhow::Result<(Findings, PathBuf)> {
+    let length = training::limits(args.seconds, args.steps, USUAL_SECONDS)?.in_words();
+    let mut head = vec!["trained".to_owned()];
+    head.extend(TOLD_SECS.map(|secs| format!("at {secs} s, dB")));
+    head.extend(["at the end, dB", "bought, dB", "SSIM", "LPIPS", "depth RMSE, mm", "splats"].map(str::to_owned));
+    let findings = Findings {
+        name: "ablation",
+        title: format!("What each part brings: {}", data.name),
+        sentences: vec![
+            format!(
+                "Each row is trained for {length} with one part left out or changed, and scored on held-out images; medians of {} seeds. \
+                 Bought: by how much the whole is better, seed by seed.",
+                args.seeds
+            ),
+            format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),
+        ],
+        charts: Vec::new(),
+        tables: vec![Table { title: format!("After {length}"), head, rows: rows.iter().map(Changed::row).collect() }],
+        numbers: serde_json::json!({
+            "bench": "ablation",
+            "data": data.path,
+            "method": data.kind.name(),
+            "adapter": runs.adapter(),
+            "changes": rows,
+        }),
+    };
+    let page = findings.write(runs.out())?;
+    Ok((findings, page))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bench::runs::tests::run;
+
+    #[test]
+    fn gains_are_told_seed_by_seed() {
+        let whole = [run("a", &[(1.0, 24.0), (4.0, 26.0)], 900), run("b", &[(1.0, 23.0), (4.0, 27.0)], 900)];
+        let changed = vec![run("a", &[(1.0, 20.0), (4.0, 25.0)], 800), run("b", &[(1.0, 21.0), (4.0, 25.0)], 1000)];
+        let changed = Changed::of("less", &whole, changed).expect("two runs");
+        assert_eq!((changed.psnr, changed.bought_db, changed.primitives), (25.0, 1.5, 900.0));
+        assert_eq!(changed.row()[..5], ["less", "20.50", "25.00", "25.00", "+1.50 (std 0.71)"]);
+    }
+
+    #[test]
+    fn what_is_off_already_is_not_tried() {
+        let options = SplatOptions { depth_per_m: 0.0, ..SplatOptions::default() };
+        let tried: Vec<&str> =
+            CHANGES.iter().filter(|change| is_change(change, &options)).map(|change| change.name).collect();
+        assert!(!tried.contains(&"no depth loss") && tried.contains(&"no growth"), "{tried:?}");
+    }
+}
