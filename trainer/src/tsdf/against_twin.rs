@@ -7,7 +7,7 @@ use super::scenes::{self, FOCAL_PX, PRINCIPAL_PX, SIZE_PX};
 use super::{TsdfModel, TsdfOptions};
 use crate::gpu::{Gpu, GpuOptions};
 use crate::mismatches::Mismatches;
-use crate::{Keyframe, Method};
+use crate::{Keyframe, Method, RenderRequest};
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
 use std::collections::BTreeSet;
@@ -59,14 +59,27 @@ fn blocks_are_given_room_where_rays_cross_them() {
 fn distances_weights_and_colors_are_those_of_the_twin() {
     for options in forms() {
         let keyframes = scene();
-        let (got, lattice, _) = fused(&options, &keyframes);
-        let mut twin: VoxelBlocks = got.keys().map(|place| (*place, reference::unseen())).collect();
-        for keyframe in &keyframes {
-            let readings = reference::readings(keyframe.depth.as_ref().unwrap(), &lattice);
-            reference::integrate(&mut twin, keyframe, &readings, &lattice);
-        }
+        let (got, twin, lattice) = fused_with_twin(&options, &keyframes);
         compare(&got, &twin, &lattice);
     }
+}
+
+/// Fuses the keyframes one after the other, on the GPU and in the twin; both give room to the same blocks.
+fn fused_with_twin(options: &GpuOptions, keyframes: &[Arc<Keyframe>]) -> (Blocks, VoxelBlocks, Lattice) {
+    let mut model = TsdfModel::new(Gpu::open(options).unwrap(), scenes::options()).unwrap();
+    let mut twin = VoxelBlocks::new();
+    for keyframe in keyframes {
+        model.push(keyframe.clone()).unwrap();
+        model.seed().unwrap();
+        let lattice = model.lattice().unwrap().clone();
+        for place in model.blocks().unwrap().into_keys() {
+            twin.entry(place).or_insert_with(reference::unseen);
+        }
+        let readings = reference::readings(keyframe.depth.as_ref().unwrap(), &lattice);
+        reference::integrate(&mut twin, keyframe, &readings, &lattice);
+    }
+    let lattice = model.lattice().unwrap().clone();
+    (model.blocks().unwrap(), twin, lattice)
 }
 
 fn compare(got: &Blocks, twin: &VoxelBlocks, lattice: &Lattice) {
@@ -104,12 +117,7 @@ fn carving_is_that_of_the_twin() {
     }
     let keyframes: Vec<_> = with.into_iter().chain(without).collect();
     for options in forms() {
-        let (got, lattice, _) = fused(&options, &keyframes);
-        let mut twin: VoxelBlocks = got.keys().map(|place| (*place, reference::unseen())).collect();
-        for keyframe in &keyframes {
-            let readings = reference::readings(keyframe.depth.as_ref().unwrap(), &lattice);
-            reference::integrate(&mut twin, keyframe, &readings, &lattice);
-        }
+        let (got, twin, lattice) = fused_with_twin(&options, &keyframes);
         compare(&got, &twin, &lattice);
     }
 }
@@ -136,7 +144,7 @@ fn pictures_are_those_of_the_twin() {
         let keyframes = scene();
         let (blocks, lattice, mut model) = fused(&options, &keyframes);
         let pose = scenes::looking(Point3::new(1.3, 0.4, 0.6), Point3::new(0.3, -0.2, 0.1));
-        let picture = model.render(&scenes::request(pose)).unwrap();
+        let picture = model.render(&RenderRequest { far_m: 3.0, ..scenes::request(pose) }).unwrap();
         let (mut n_hits, mut n_off) = (0_usize, 0_usize);
         let mut wrong = Mismatches::default();
         for (ix, ray) in rays(&pose, &lattice).iter().enumerate() {

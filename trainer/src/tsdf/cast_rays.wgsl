@@ -179,6 +179,7 @@ fn march(ray: Ray) -> f32 {
     let speed = length(ray.along);
     var at_m = ray.begin_m;
     var outside = vec2f(-1.0, 0.0); // Depth and distance of the last place known to be outside; depth -1: none.
+    var careful_m = -1.0; // Up to this depth steps are short: a long one passed a place that nobody saw.
     for (var i = 0u; i < MAX_STEPS; i++) {
         if !(at_m < ray.end_m) { break; }
         let point = ray.origin + ray.along * at_m;
@@ -195,21 +196,28 @@ fn march(ray: Ray) -> f32 {
         }
         let word = geometry[(slot - 1u) * BLOCK_VOXELS + voxel_in_block(voxel)];
         let nearest = stored_distance(word) * field.scale_m / field.voxel_m;
-        if stored_weight(word) != 0u && nearest > 1.5 {
+        let is_careful = at_m < careful_m;
+        if stored_weight(word) != 0u && nearest > 1.5 && !is_careful {
             outside = vec2f(at_m, nearest);
             at_m += 0.8 * nearest / speed;
             continue;
         }
         let here = distance_at(point);
         if here == UNKNOWN {
-            at_m += 0.5 / speed;
+            at_m += select(0.5, 0.25, is_careful) / speed;
         } else if here >= 0.0 {
             outside = vec2f(at_m, here);
-            at_m += max(0.8 * here, 0.25) / speed;
+            at_m += select(max(0.8 * here, 0.25), 0.25, is_careful) / speed;
         } else {
             if outside.x >= 0.0 {
                 let found = crossing(ray, outside.x, at_m, outside.y, here, speed);
                 if found != UNKNOWN { return found; }
+                if !is_careful {
+                    careful_m = at_m + 0.5 / speed;
+                    at_m = outside.x;
+                    outside.x = -1.0;
+                    continue;
+                }
             }
             outside.x = -1.0;
             at_m += max(-0.8 * here, 0.5) / speed;

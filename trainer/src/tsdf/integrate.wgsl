@@ -5,7 +5,8 @@
 //           visible [N_VISIBLE]
 // writes    geometry, colors [n_blocks * 512], changed [n_blocks] (1 where a voxel changed)
 // twin      tsdf/reference/integrate.rs
-// source    Curless and Levoy 1996, section 3; weights: Newcombe et al. 2011 (angle) and Oleynikova et al. 2017 (Voxblox:
+// source    Curless and Levoy 1996, section 3; weights: Newcombe et al. 2011 (angle; here the square of
+//           its cosine, as an error across the ray moves the surface by its tangent) and Oleynikova et al. 2017 (Voxblox:
 //           inverse square of distance, drop behind the surface). Ours: distances are taken along the surface's normal,
 //           and what is seen through loses weight instead of gaining a distance it cannot have: to see past a voxel says
 //           that nothing solid is there, not how far the nearest surface is.
@@ -92,17 +93,21 @@ fn fuse(at: u32, point_in_field: vec3f) -> bool {
     if !(reading.x > 0.0) { return false; }
     let distance_m = (reading.x - point.z) * max(reading.y, MIN_TURNED);
     let truncation_m = truncation_at(field, reading.x);
-    if !(distance_m >= -truncation_m) { return false; } // Hidden.
     let ray_m = length(ray_of(frame, place_px));
+    // Along the ray, not the normal: past the rim of a thing a ray soon leaves it again.
+    let behind_m = (point.z - reading.x) * ray_m;
+    if !(behind_m <= truncation_m) { return false; } // Hidden.
     let nearness = min(1.0, 1.0 / (reading.x * reading.x));
-    let behind = clamp((truncation_m + distance_m) / (truncation_m - field.voxel_m), 0.0, 1.0);
-    let gain = nearness * (reading.y / ray_m) * behind;
+    let behind = clamp((truncation_m - behind_m) / (truncation_m - field.voxel_m), 0.0, 1.0);
+    let cosine = reading.y / ray_m;
+    let gain = nearness * cosine * cosine * behind;
     let old = geometry[at];
     let weight = stored_weight(old);
     if distance_m > truncation_m {
-        // Seen through: that counts against what was taken for solid, and says nothing else.
+        // Seen through: that counts against what was taken for solid, and says nothing else. How well it is seen is a
+        // matter of where the voxel is, not of what lies behind it.
         if weight == 0u || stored_distance(old) >= 0.0 { return false; }
-        let lost = u32(clamp(floor(CARVING * WEIGHT_ONE * gain + 0.5), 1.0, CARVING * WEIGHT_ONE));
+        let lost = u32(max(floor(CARVING * WEIGHT_ONE * min(1.0, 1.0 / (point.z * point.z)) + 0.5), 1.0));
         geometry[at] = select(old - (lost << 16u), 0u, lost >= weight);
         return true;
     }

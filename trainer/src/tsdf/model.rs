@@ -244,12 +244,34 @@ impl TsdfModel {
         if need > most { self.send_away(need - most) } else { Ok(()) }
     }
 
+    /// Draws one pinhole view.
     fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3]) -> Result<Picture, Error> {
+        if !self.record_picture(camera, background_srgb)? {
+            return Ok(empty_picture(camera.size_px, background_srgb));
+        }
+        self.passes.submit(&self.gpu);
+        let canvas = self.canvas.as_ref().ok_or(Error::DeviceLost)?;
+        let n = camera.size_px[0] as usize * camera.size_px[1] as usize;
+        let pixels: Vec<u32> = self.gpu.read(&canvas.pixels, n)?;
+        let depth_m = self.gpu.read(&canvas.depths, n)?;
+        Ok(Picture { size_px: camera.size_px, rgba_srgb: bytemuck::cast_slice(&pixels).to_vec(), depth_m })
+    }
+
+    /// GPU time of a pinhole picture, milliseconds, without bringing it to the host; `None` where the adapter tells none.
+    pub fn profile_picture(&mut self, request: &RenderRequest) -> Result<Option<f64>, Error> {
+        self.settle()?;
+        let Projection::Pinhole { focal_px, principal_px } = request.projection else { return Ok(None) };
+        if !self.record_picture(&camera_of(request, focal_px, principal_px), request.background_srgb)? {
+            return Ok(None);
+        }
+        self.passes.submit_spanned(&self.gpu)
+    }
+
+    /// Lists what a picture takes; false where there is nothing to draw.
+    fn record_picture(&mut self, camera: &Camera, background_srgb: [f32; 3]) -> Result<bool, Error> {
         let [width, height] = camera.size_px;
         let n = u64::from(width) * u64::from(height);
-        let Some(lattice) = self.lattice.clone().filter(|_| self.field.is_some()) else {
-            return Ok(empty_picture(camera.size_px, background_srgb));
-        };
+        let Some(lattice) = self.lattice.clone().filter(|_| self.field.is_some()) else { return Ok(false) };
         let in_field = in_field(camera, &lattice);
         self.bring_for(&in_field)?;
         if self.canvas.as_ref().is_none_or(|canvas| canvas.n_pixels < n) {
@@ -260,11 +282,22 @@ impl TsdfModel {
         let (Some(field), Some(canvas)) = (&self.field, &self.canvas) else { return Err(Error::DeviceLost) };
         canvas.aim(&self.gpu, &in_field.view(), background_srgb);
         passes::draw(&self.gpu, &mut self.passes, &self.pipelines, field, canvas, camera.size_px);
-        self.passes.submit(&self.gpu);
-        let n = usize::try_from(n).unwrap_or(usize::MAX);
-        let pixels: Vec<u32> = self.gpu.read(&canvas.pixels, n)?;
-        let depth_m = self.gpu.read(&canvas.depths, n)?;
-        Ok(Picture { size_px: camera.size_px, rgba_srgb: bytemuck::cast_slice(&pixels).to_vec(), depth_m })
+        Ok(true)
+    }
+}
+
+/// The camera that a picture is asked from.
+fn camera_of(request: &RenderRequest, focal_px: [f64; 2], principal_px: [f64; 2]) -> Camera {
+    Camera {
+        world_from_camera: request.world_from_camera,
+        size_px: request.size_px,
+        focal_px,
+        principal_px,
+        shutter: request.shutter,
+        near_m: request.near_m,
+        far_m: request.far_m,
+        crop: request.crop,
+        low_pass_px2: LOW_PASS_PX2,
     }
 }
 
@@ -379,17 +412,7 @@ impl Method for TsdfModel {
         }
         match request.projection {
             Projection::Pinhole { focal_px, principal_px } => {
-                let camera = Camera {
-                    world_from_camera: request.world_from_camera,
-                    size_px: request.size_px,
-                    focal_px,
-                    principal_px,
-                    shutter: request.shutter,
-                    near_m: request.near_m,
-                    far_m: request.far_m,
-                    crop: request.crop,
-                    low_pass_px2: LOW_PASS_PX2,
-                };
+                let camera = camera_of(request, focal_px, principal_px);
                 self.draw_view(&camera, request.background_srgb)
             }
             Projection::Equirectangular => {

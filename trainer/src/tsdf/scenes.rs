@@ -99,6 +99,23 @@ pub(super) fn keyframe(ix: i64, shapes: &[Shape], world_from_camera: Transform) 
     }
 }
 
+/// The same in the size of a depth camera's images.
+pub(super) fn large_keyframe(ix: i64, shapes: &[Shape], world_from_camera: Transform) -> Keyframe {
+    let (size_px, focal_px, principal_px) = ([640, 480], [525.0; 2], [320.0, 240.0]);
+    let mut keyframe = keyframe(ix, shapes, world_from_camera);
+    let hits: Vec<_> = seen(shapes, &world_from_camera, size_px, focal_px, principal_px).collect();
+    let colors = hits.iter().flat_map(|hit| {
+        let [red, green, blue] = hit.map_or([0; 3], |(_, point)| bytes(color_srgb(&point)));
+        [red, green, blue, 255]
+    });
+    keyframe.rgba_srgb = colors.collect::<Vec<u8>>().into();
+    (keyframe.size_px, keyframe.focal_px, keyframe.principal_px) = (size_px, focal_px, principal_px);
+    keyframe.world_from_camera = world_from_camera;
+    let depth_m: Vec<f32> = hits.iter().map(|hit| hit.map_or(0.0, |(depth, _)| f32_of(depth))).collect();
+    keyframe.depth = Some(DepthMap { size_px, focal_px, principal_px, depth_m: depth_m.into(), world_from_camera });
+    keyframe
+}
+
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "colors lie between 0 and 1")]
 fn bytes(color: [f64; 3]) -> [u8; 3] {
     color.map(|part| (255.0 * part).round() as u8)

@@ -1,10 +1,11 @@
 //! The model as a whole: what it draws, carves, keeps and gives up.
+#![expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "shares of small counts")]
 
 use super::scenes::{self, SIZE_PX, Shape};
 use super::{TsdfModel, TsdfOptions};
 use crate::checkpoint::Checkpoint;
 use crate::gpu::{Gpu, GpuOptions};
-use crate::{Aabb, Error, Keyframe, Method, Picture, Projection};
+use crate::{Aabb, Error, Keyframe, Method, Picture, Projection, RenderRequest};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
@@ -56,8 +57,11 @@ fn a_drawn_view_is_what_the_camera_saw() {
         .map(|(got, seen)| f64::from(got - seen).abs())
         .collect();
     assert!(errors.len() > 4000, "{}", errors.len());
-    let mean_m = errors.iter().sum::<f64>() / errors.len() as f64;
-    assert!(mean_m < 0.004, "depth is off by {mean_m} m"); // Edges of the ball among them.
+    let mut sorted = errors;
+    sorted.sort_by(f64::total_cmp);
+    let of = |share: f64| sorted[(share * sorted.len() as f64) as usize];
+    // At the rim of the ball a pixel may fall to the other side.
+    assert!(of(0.5) < 0.0005 && of(0.95) < 0.002 && of(0.98) < 0.02, "{} {} {}", of(0.5), of(0.95), of(0.98));
     assert!(picture.rgba_srgb.chunks_exact(4).zip(&picture.depth_m).all(|(rgba, z)| (rgba[3] == 255) == (*z > 0.0)));
 }
 
@@ -214,7 +218,7 @@ fn half_the_memory_loses_nothing() {
     assert!(scarce.n_waiting() > 0);
     assert!(scarce.blocks().unwrap() == plenty.blocks().unwrap());
     for keyframe in [&keyframes[0], &keyframes[2], &keyframes[5]] {
-        let request = scenes::request(view_of(keyframe));
+        let request = RenderRequest { far_m: 3.0, ..scenes::request(view_of(keyframe)) };
         assert!(same(&scarce.render(&request).unwrap(), &plenty.render(&request).unwrap()));
     }
     assert!(scarce.mesh().unwrap() == plenty.mesh().unwrap());
@@ -237,11 +241,7 @@ fn a_saved_model_draws_the_same_bits() {
     }
     let mut loaded = TsdfModel::load(gpu(), folder.path()).unwrap();
     let mut requests = vec![scenes::request(view_of(&keyframes[1]))];
-    requests.push(crate::RenderRequest {
-        projection: Projection::Equirectangular,
-        size_px: [64, 32],
-        ..requests[0].clone()
-    });
+    requests.push(RenderRequest { projection: Projection::Equirectangular, size_px: [64, 32], ..requests[0].clone() });
     for request in requests {
         assert!(same(&loaded.render(&request).unwrap(), &model.render(&request).unwrap()));
     }
@@ -307,11 +307,12 @@ fn crops_and_ranges_cut_the_picture() {
         max_m: corner.into(),
     });
     let cropped = model.render(&request).unwrap();
-    let mut n = 0;
+    let (mut n, mut n_off) = (0, 0);
     for (ix, depth) in cropped.depth_m.iter().enumerate().filter(|(_, depth)| **depth > 0.0) {
         n += 1;
-        assert!((depth - whole.depth_m[ix]).abs() < 0.02);
+        n_off += usize::from((depth - whole.depth_m[ix]).abs() > 0.001);
     }
+    assert!(100 * n_off < n, "{n_off} of {n}"); // At the rim.
     let n_whole = whole.depth_m.iter().filter(|depth| **depth > 0.0).count();
     assert!(n > 500 && 2 * n < n_whole, "{n} of {n_whole}");
     request.crop = None;
@@ -361,4 +362,45 @@ fn voxels_follow_the_pixels_and_the_noise() {
     assert!((chosen.noise_per_m2 / expected - 1.0).abs() < 0.1, "{chosen:?}, expected {expected}");
     assert!(chosen.voxel_m > 0.06 && chosen.truncation_m >= 4.0 * chosen.voxel_m - 1e-9, "{chosen:?}");
     assert_eq!(depth.depth_m.len(), (SIZE_PX[0] * SIZE_PX[1]) as usize);
+}
+
+/// What a frame of 640x480 costs: `cargo test --release -p trainer --lib frame_of_640x480 -- --ignored --nocapture`.
+#[test]
+#[ignore = "a measurement"]
+fn frame_of_640x480() {
+    let shapes = [
+        Shape::Sphere { center_m: Point3::new(0.0, 0.0, 0.3), radius_m: 0.3 },
+        Shape::Plane { normal: Vector3::z(), offset_m: 0.0 },
+        Shape::Plane { normal: Vector3::new(0.0, -1.0, 0.0), offset_m: -1.5 },
+    ];
+    let options = || TsdfOptions { voxel_m: Some(0.01), noise_per_m2: Some(1.5e-3), ..TsdfOptions::default() };
+    let gpu = gpu();
+    println!("{}", gpu.describe());
+    let mut model = TsdfModel::new(gpu, options()).unwrap();
+    let frame = |ix: i64| {
+        let turn = 0.02 * ix as f64 - 1.57;
+        let eye = Point3::new(1.6 * turn.cos(), 1.6 * turn.sin(), 0.9);
+        Arc::new(scenes::large_keyframe(ix, &shapes, scenes::looking(eye, Point3::new(0.0, 0.3, 0.3))))
+    };
+    for ix in 0..8 {
+        model.push(frame(ix)).unwrap();
+    }
+    model.seed().unwrap();
+    for ix in 8..12 {
+        model.push(frame(ix)).unwrap();
+        let timings = model.profile_step().unwrap();
+        let sum: f64 = timings.iter().map(|timing| timing.millis).sum();
+        println!("{:?} {sum:.2} ms", timings.iter().map(|timing| (timing.name, timing.millis)).collect::<Vec<_>>());
+    }
+    println!("{:?}", model.progress());
+    let request = scenes::request(scenes::looking(Point3::new(0.1, -1.6, 0.9), Point3::new(0.0, 0.3, 0.3)));
+    let focal_px = [525.0; 2];
+    let projection = Projection::Pinhole { focal_px, principal_px: [320.0, 240.0] };
+    let request = RenderRequest { size_px: [640, 480], projection, ..request };
+    for _ in 0..3 {
+        println!("picture: {:?} ms", model.profile_picture(&request).unwrap());
+    }
+    let begin = std::time::Instant::now();
+    let mesh = model.mesh().unwrap();
+    println!("mesh: {} triangles, {:.1} ms of wall time", mesh.triangles.len(), begin.elapsed().as_secs_f64() * 1e3);
 }

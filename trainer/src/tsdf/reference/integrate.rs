@@ -58,15 +58,17 @@ fn fuse(
     }
     let distance_m = (reading.depth_m - point.z) * reading.turned.max(MIN_TURNED);
     let truncation_m = lattice.truncation_at(reading.depth_m);
-    if distance_m < -truncation_m {
+    let ray_m = ray_of(depth, place_px).norm();
+    let behind_m = (point.z - reading.depth_m) * ray_m;
+    if behind_m > truncation_m {
         return;
     }
     let nearness = (1.0 / (reading.depth_m * reading.depth_m)).min(1.0);
-    let behind = ((truncation_m + distance_m) / (truncation_m - lattice.voxel_m)).clamp(0.0, 1.0);
-    let gain = nearness * (reading.turned / ray_of(depth, place_px).norm()) * behind;
+    let behind = ((truncation_m - behind_m) / (truncation_m - lattice.voxel_m)).clamp(0.0, 1.0);
+    let gain = nearness * (reading.turned / ray_m).powi(2) * behind;
     if distance_m > truncation_m {
         if voxel.weight > 0.0 && voxel.distance_m < 0.0 {
-            let lost = (CARVING * 256.0 * gain + 0.5).floor().clamp(1.0, CARVING * 256.0);
+            let lost = (CARVING * 256.0 * (1.0 / (point.z * point.z)).min(1.0) + 0.5).floor().max(1.0);
             if lost >= voxel.weight {
                 (voxel.distance_m, voxel.weight) = (0.0, 0.0);
             } else {
