@@ -158,8 +158,8 @@ fn pictures_are_those_of_the_twin() {
                 n_off += usize::from(hit.is_some() || got > 0.0);
                 continue;
             };
-            for part in 0..3 {
-                wrong.check(format!("{ix} {part}"), f64::from(rgba[part]), 255.0 * hit.color_srgb[part], 3.0, 0.0);
+            for (got, expected) in rgba.iter().zip(hit.color_srgb) {
+                wrong.check(ix, f64::from(*got), 255.0 * expected, 3.0, 0.0);
             }
         }
         assert!(n_hits > 2000, "{n_hits}");

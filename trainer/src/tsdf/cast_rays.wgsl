@@ -28,6 +28,7 @@ struct Backdrop {
 
 const MAX_STEPS = 4096u;
 const N_REFINE = 8u;
+const CLOSE = 1e-3;           // voxels
 const UNKNOWN = 1e9;
 
 // Of the chunk and block looked up last.
@@ -74,14 +75,24 @@ fn place_of(voxel: vec3i) -> u32 {
 fn distance_at(point: vec3f) -> f32 {
     let corner = floor(point - 0.5);
     let share = point - 0.5 - corner;
+    let voxel = vec3i(corner);
+    let is_inside = all((voxel & vec3i(7)) < vec3i(7)); // All eight in one block.
+    var at = 0u;
+    if is_inside {
+        at = place_of(voxel);
+        if at == 0u { return UNKNOWN; }
+    }
     var sum = 0.0;
-    for (var i = 0; i < 8; i++) {
-        let offset = vec3i(i & 1, (i >> 1u) & 1, i >> 2u);
-        let place = place_of(vec3i(corner) + offset);
-        if place == 0u { return UNKNOWN; }
+    for (var i = 0u; i < 8u; i++) {
+        let offset = vec3u(i & 1u, (i >> 1u) & 1u, i >> 2u);
+        var place = at + offset.x + 8u * offset.y + 64u * offset.z;
+        if !is_inside {
+            place = place_of(voxel + vec3i(offset));
+            if place == 0u { return UNKNOWN; }
+        }
         let word = geometry[place - 1u];
         if stored_weight(word) == 0u { return UNKNOWN; }
-        let part = select(1.0 - share, share, offset == vec3i(1));
+        let part = select(1.0 - share, share, offset == vec3u(1u));
         sum += part.x * part.y * part.z * stored_distance(word);
     }
     return sum * field.scale_m / field.voxel_m;
@@ -169,6 +180,7 @@ fn crossing(ray: Ray, outside_m: f32, inside_m: f32, outside_distance: f32, insi
         at_m = select(low.x + (high.x - low.x) * low.y / (low.y - high.y), 0.5 * (low.x + high.x), even);
         let here = distance_at(ray.origin + ray.along * at_m);
         if here == UNKNOWN { return UNKNOWN; }
+        if abs(here) < CLOSE { break; }
         if here >= 0.0 { low = vec2f(at_m, here); } else { high = vec2f(at_m, here); }
     }
     return at_m;
@@ -197,7 +209,11 @@ fn march(ray: Ray) -> f32 {
         let word = geometry[(slot - 1u) * BLOCK_VOXELS + voxel_in_block(voxel)];
         let nearest = stored_distance(word) * field.scale_m / field.voxel_m;
         let is_careful = at_m < careful_m;
-        if stored_weight(word) != 0u && nearest > 1.5 && !is_careful {
+        if stored_weight(word) == 0u { // One of the eight around, so they say nothing either.
+            at_m += select(1.0, 0.25, is_careful) / speed;
+            continue;
+        }
+        if nearest > 1.5 && !is_careful {
             outside = vec2f(at_m, nearest);
             at_m += 0.8 * nearest / speed;
             continue;

@@ -375,7 +375,7 @@ fn frame_of_640x480() {
     ];
     let options = || TsdfOptions { voxel_m: Some(0.01), noise_per_m2: Some(1.5e-3), ..TsdfOptions::default() };
     let gpu = gpu();
-    println!("{}", gpu.describe());
+    eprintln!("{}", gpu.describe());
     let mut model = TsdfModel::new(gpu, options()).unwrap();
     let frame = |ix: i64| {
         let turn = 0.02 * ix as f64 - 1.57;
@@ -390,17 +390,17 @@ fn frame_of_640x480() {
         model.push(frame(ix)).unwrap();
         let timings = model.profile_step().unwrap();
         let sum: f64 = timings.iter().map(|timing| timing.millis).sum();
-        println!("{:?} {sum:.2} ms", timings.iter().map(|timing| (timing.name, timing.millis)).collect::<Vec<_>>());
+        eprintln!("{:?} {sum:.2} ms", timings.iter().map(|timing| (timing.name, timing.millis)).collect::<Vec<_>>());
     }
-    println!("{:?}", model.progress());
+    eprintln!("{:?}", model.progress());
     let request = scenes::request(scenes::looking(Point3::new(0.1, -1.6, 0.9), Point3::new(0.0, 0.3, 0.3)));
     let focal_px = [525.0; 2];
     let projection = Projection::Pinhole { focal_px, principal_px: [320.0, 240.0] };
     let request = RenderRequest { size_px: [640, 480], projection, ..request };
-    for _ in 0..3 {
-        println!("picture: {:?} ms", model.profile_picture(&request).unwrap());
+    for _ in 0..6 {
+        eprintln!("picture: {:?} ms", model.profile_picture(&request).unwrap());
     }
     let begin = std::time::Instant::now();
     let mesh = model.mesh().unwrap();
-    println!("mesh: {} triangles, {:.1} ms of wall time", mesh.triangles.len(), begin.elapsed().as_secs_f64() * 1e3);
+    eprintln!("mesh: {} triangles, {:.1} ms of wall time", mesh.triangles.len(), begin.elapsed().as_secs_f64() * 1e3);
 }
