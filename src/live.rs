@@ -83,14 +83,14 @@ impl Live {
         let n_before = self.keyframes.len();
         match self.pace {
             Pace::RealTime => {
-                let patience = if self.is_training() { Duration::ZERO } else { IDLE };
+                let patience = if self.is_training() && !self.session.is_idle() { Duration::ZERO } else { IDLE };
                 while let Some(change) = self.feed.next(patience) {
                     self.apply(change)?;
                 }
             }
             Pace::Lockstep { steps_per_keyframe } => {
                 let step = self.session.progress().step;
-                while !self.feed.ended() && step >= self.next_keyframe_at {
+                while !self.feed.ended() && (step >= self.next_keyframe_at || self.session.is_idle()) {
                     let Some(change) = self.feed.next(IDLE) else { break };
                     let is_new = matches!(change, Change::Accepted(_));
                     self.apply(change)?;

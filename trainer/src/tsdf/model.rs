@@ -387,6 +387,14 @@ impl Method for TsdfModel {
         Ok(n_frames as u64)
     }
 
+    fn is_idle(&self) -> bool {
+        self.pending.is_empty()
+    }
+
+    fn primitive(&self) -> &'static str {
+        "block"
+    }
+
     fn n_taken(&mut self) -> Result<u64, Error> {
         self.settle()?;
         Ok(self.step)
