@@ -41,12 +41,13 @@ impl Lattice {
     ///
     /// A voxel is as wide as a pixel at the median depth, no less than twice the noise there, and wide enough that what
     /// this image shows takes a tenth of `max_bytes`. Noise is what is left of depth when a plane through neighbors is
-    /// taken away: `median |z[-1] - 2 z[0] + z[1]| / (0.6745 sqrt(6))`.
+    /// taken away: of `|z[-1] - 2 z[0] + z[1]|` the 90th percentile over `1.6449 sqrt(6)`. Not the median: where a sensor
+    /// tells whole steps that is 0.
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a weight is clamped to 16 bits")]
     pub fn choose(options: &TsdfOptions, depth: &DepthMap) -> Option<Self> {
         let mut depths: Vec<f64> = believed(options, depth).map(|(_, z)| z).collect();
         let n_believed = depths.len();
-        let median_m = median(&mut depths)?;
+        let median_m = quantile(&mut depths, 5)?;
         let noise_per_m2 = usable(options.noise_per_m2).unwrap_or_else(|| noise_per_m2(options, depth));
         let px_m = median_m / (0.5 * (depth.focal_px[0] + depth.focal_px[1]));
         let by_noise_m = 2.0 * noise_per_m2 * median_m * median_m;
@@ -104,13 +105,14 @@ fn noise_per_m2(options: &TsdfOptions, depth: &DepthMap) -> f64 {
         .filter(|(ix, _)| ix % width > 0 && ix % width + 1 < width)
         .filter_map(|(ix, z)| Some((at(ix - 1)? - 2.0 * z + at(ix + 1)?).abs() / (z * z)))
         .collect();
-    median(&mut bends).unwrap_or(0.0) / (0.6745 * 6.0f64.sqrt())
+    quantile(&mut bends, 9).unwrap_or(0.0) / (1.6449 * 6.0f64.sqrt())
 }
 
-fn median(values: &mut [f64]) -> Option<f64> {
-    let middle = values.len() / 2;
+/// The value that so many tenths lie below.
+fn quantile(values: &mut [f64], tenths: usize) -> Option<f64> {
+    let at = values.len() * tenths / 10;
     if values.is_empty() {
         return None;
     }
-    Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
+    Some(*values.select_nth_unstable_by(at, f64::total_cmp).1)
 }

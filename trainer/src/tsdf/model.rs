@@ -157,9 +157,12 @@ impl TsdfModel {
 
     /// Settles voxels by the first depth image that shows something; those before it are done with. False where none does.
     fn begin(&mut self) -> Result<bool, Error> {
+        // What one binding holds is a limit as good as any.
+        let max_bytes = Some(u64::from(self.most_blocks()) * buffers::BYTES_PER_BLOCK);
+        let options = TsdfOptions { max_bytes, ..self.options.clone() };
         while self.lattice.is_none() {
             let Some(first) = self.pending.front() else { return Ok(false) };
-            let chosen = first.depth.as_ref().and_then(|depth| Lattice::choose(&self.options, depth));
+            let chosen = first.depth.as_ref().and_then(|depth| Lattice::choose(&options, depth));
             if let Some(lattice) = chosen {
                 let n_blocks = FIRST_CAPACITY.n_blocks.min(self.most_blocks());
                 self.field = Some(FieldBuffers::new(&self.gpu, &lattice, Capacity { n_blocks, ..FIRST_CAPACITY })?);
