@@ -174,6 +174,14 @@ impl TsdfModel {
         Ok(!self.pending.is_empty())
     }
 
+    /// Fuses one keyframe where none was: then there is something to show. No more than that, or looking would count as learning.
+    fn fuse_first(&mut self) -> Result<(), Error> {
+        while self.step == 0 && !self.pending.is_empty() {
+            self.step(1)?;
+        }
+        Ok(())
+    }
+
     /// Takes the first pending keyframe for done.
     fn pass_over(&mut self) {
         if let Some(keyframe) = self.pending.pop_front() {
@@ -418,9 +426,7 @@ impl Method for TsdfModel {
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         self.settle()?;
-        if self.step == 0 {
-            self.seed()?;
-        }
+        self.fuse_first()?;
         match request.projection {
             Projection::Pinhole { focal_px, principal_px } => {
                 let camera = camera_of(request, focal_px, principal_px);

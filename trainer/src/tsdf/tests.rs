@@ -183,6 +183,15 @@ fn the_same_keyframes_give_the_same_bits_however_they_come() {
 }
 
 #[test]
+fn looking_fuses_no_more_than_one_keyframe() {
+    // So fine that the first frame finds no room at first.
+    let mut model = started(TsdfOptions { voxel_m: Some(0.006), ..scenes::options() }, &ball_on_floor(3));
+    model.step(2).unwrap();
+    model.render(&scenes::request(view_of(&ball_on_floor(1)[0]))).unwrap();
+    assert!((1..=2).contains(&model.progress().step), "{:?}", model.progress());
+}
+
+#[test]
 fn a_small_pool_grows_and_changes_nothing() {
     // Voxels so fine that the pool and the table begin too small.
     let fine = TsdfOptions { voxel_m: Some(0.006), ..scenes::options() };

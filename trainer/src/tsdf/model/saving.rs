@@ -38,9 +38,8 @@ impl TsdfModel {
     }
 
     pub(super) fn write_folder(&mut self, folder: &Path) -> Result<(), Error> {
-        if self.step == 0 {
-            self.seed()?;
-        }
+        self.settle()?;
+        self.fuse_first()?;
         let refused = |path: &Path, source| Error::Write { path: path.to_owned(), source };
         std::fs::create_dir_all(folder).map_err(|source| refused(folder, source))?;
         let mesh = self.mesh()?;
