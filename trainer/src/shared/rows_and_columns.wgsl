@@ -1,5 +1,5 @@
 // rows_and_columns: windows of 11 x 11 pixels for a workgroup of 8 lanes, all of one subgroup, on adapters whose lanes read
-// memory one after the other: each value is read once, and what a window needs of its neighbours stays in the lanes.
+// memory one after the other: a workgroup reads each value once, and what windows share of it stays in the lanes.
 //
 // A lane has 4 neighbouring pixels of a row, and the workgroup goes down the rows. The two lanes at either side only look:
 // what is left is a tile's width. After `supervision`.
@@ -21,8 +21,9 @@ fn color_strip(group: u32, lane: u32, n_tiles: vec2u) -> ColorStrip {
     let column = strip % n_tiles.x * TILE_PX;
     let row = strip / n_tiles.x * STRIP_TILES * TILE_PX;
     let corner = vec2i(vec2u(column + 4u * lane, row)) - vec2i(8, i32(HALO));
+    let in_grid = row < n_tiles.y * TILE_PX;
     let writes = lane >= 2u && lane < 6u;
-    return ColorStrip((row < n_tiles.y * TILE_PX), group % 3u, corner, writes);
+    return ColorStrip(in_grid, group % 3u, corner, writes);
 }
 
 const G = GAUSSIAN;
