@@ -270,7 +270,7 @@ fn between_pixels(picture: &Picture, at: [f32; 2]) -> [f32; 3] {
     let [width, height] = picture.size_px;
     let x = (at[0] - 0.5).clamp(0.0, width as f32 - 1.001);
     let y = (at[1] - 0.5).clamp(0.0, height as f32 - 1.001);
-    let (column, row) = (x as usize, y as usize);
+    let (column, row) = (x as u32 as usize, y as u32 as usize);
     let (fx, fy) = (x - column as f32, y - row as f32);
     let stride = 3 * width as usize;
     let start = row * stride + 3 * column;
@@ -288,6 +288,7 @@ fn between_pixels(picture: &Picture, at: [f32; 2]) -> [f32; 3] {
 const MAX_VIEW_PX: u32 = 8192;
 
 fn nearest_depth(picture: &Picture, at: [f32; 2]) -> f32 {
-    let index = |axis: usize| (at[axis].max(0.0) as usize).min(picture.size_px[axis] as usize - 1);
+    // As u32, which a processor converts to in fewer instructions.
+    let index = |axis: usize| (at[axis].max(0.0) as u32).min(picture.size_px[axis] - 1) as usize;
     picture.depth_m[index(1) * picture.size_px[0] as usize + index(0)]
 }
