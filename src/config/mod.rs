@@ -234,6 +234,25 @@ impl Rig {
         write::rig(self)
     }
 
+    /// Whether its cameras see the same of the same readings: where they sit, their lenses, delays and depth, and the joints' zeros.
+    pub(crate) fn sees_like(&self, other: &Self) -> bool {
+        const SAME: f64 = 1e-9; // Reading a pose back may turn its last bit.
+        let is_same = |one: &Camera, other: &Camera| {
+            let apart = one.parent_from_camera.inverse() * other.parent_from_camera;
+            one.name == other.name
+                && one.parent == other.parent
+                && apart.translation.vector.norm() < SAME
+                && apart.rotation.angle() < SAME
+                && one.intrinsics == other.intrinsics
+                && one.stamp_to_mid_exposure == other.stamp_to_mid_exposure
+                && one.readout_micros == other.readout_micros
+                && one.depth == other.depth
+        };
+        self.arm.joint_offsets == other.arm.joint_offsets
+            && self.cameras.len() == other.cameras.len()
+            && self.cameras.iter().zip(&other.cameras).all(|(one, other)| is_same(one, other))
+    }
+
     /// Writes the settled rig file and the robot's description into a folder, and says where the rig file is.
     pub(crate) fn write_settled(&self, folder: &Path) -> std::io::Result<PathBuf> {
         let path = folder.join(drivers::recording::RIG_FILE);
