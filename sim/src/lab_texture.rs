@@ -262,7 +262,7 @@ pub(crate) fn floor_tiles(size_m: [f64; 2], lane_m: f64) -> Texture {
         let (column, row) = ((x * 2.0).floor(), (y * 2.0).floor());
         let joint = ((x * 2.0).fract().abs() - 0.5).abs().max(((y * 2.0).fract().abs() - 0.5).abs());
         let own = each.unit((column + 64.0) as u64 * 128 + (row + 64.0) as u64);
-        let tile = mix([0.30, 0.33, 0.36], [0.62, 0.60, 0.55], 0.25 + 0.5 * own);
+        let tile = mix([0.15, 0.17, 0.20], [0.80, 0.77, 0.70], 0.1 * own + 0.9 * step(0.45, 0.55, own));
         let speckled = 0.62 + 0.5 * rough.rough(x * 22.0, y * 22.0, 3) + 0.3 * blotch.rough(x * 1.3, y * 1.3, 4);
         let floor = mix([0.16, 0.16, 0.17], scale(tile, speckled), step(0.496, 0.484, joint));
         let lane = (x.abs().max(y.abs() * 1.25) - lane_m).abs();
@@ -279,8 +279,8 @@ pub(crate) fn painted_wall() -> Texture {
         let grain = 0.75 + 0.4 * rough.rough((u * 2.0 - 1.0).abs() * 40.0, v * 80.0, 4);
         let stained = stain.rough((u * 2.0 - 1.0).abs() * 5.0, v * 7.0, 5);
         let seam = (u * 4.0).fract() < 0.012;
-        let plaster = mix([0.80, 0.77, 0.68], [0.58, 0.62, 0.64], step(0.40, 0.62, stained));
-        let dado = mix([0.20, 0.42, 0.38], [0.36, 0.50, 0.40], step(0.35, 0.6, stained));
+        let plaster = mix([0.92, 0.88, 0.78], [0.56, 0.62, 0.66], step(0.40, 0.62, stained));
+        let dado = mix([0.10, 0.26, 0.24], [0.22, 0.38, 0.30], step(0.35, 0.6, stained));
         let wall = if v > 0.645 {
             dado
         } else if v > 0.62 {

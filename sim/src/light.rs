@@ -42,15 +42,15 @@ impl Lamp {
     }
 }
 
-/// The lamps and the ambient light as MJCF: elements of the world body, and of the visual settings.
-pub(crate) fn mjcf() -> (String, String) {
-    let list = |numbers: [f64; 3]| numbers.map(|number| number.to_string()).join(" ");
+/// The lamps and the ambient light as MJCF, brighter by a factor: elements of the world body, and of the visual settings.
+pub(crate) fn mjcf(gain: f64) -> (String, String) {
+    let list = |numbers: [f64; 3]| numbers.map(|number| (gain * number).to_string()).join(" ");
     let mut lamps = String::new();
     for lamp in [&KEY].into_iter().chain(&FILLS) {
         let _ = writeln!(
             lamps,
             "<light directional=\"true\" pos=\"0.7 0 2\" dir=\"{}\" diffuse=\"{}\" specular=\"{}\" castshadow=\"false\"/>",
-            list(lamp.direction),
+            lamp.direction.map(|number| number.to_string()).join(" "),
             list(lamp.diffuse),
             list([lamp.specular; 3])
         );

@@ -26,6 +26,15 @@ pub(crate) fn near_far_m(scene: Scene) -> [f64; 2] {
     }
 }
 
+/// Factor on all lamps: rooms whose walls face away from the key lamp need more.
+fn brightness(scene: Scene) -> f64 {
+    match scene {
+        Scene::StaticArm => 1.0,
+        Scene::MobileBase => 1.35,
+        Scene::MobileArm => 1.15,
+    }
+}
+
 /// Builds the model for pictures of up to `largest_px`.
 pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Error> {
     let mut files = MjVfs::new();
@@ -51,7 +60,7 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
     }
     let [near, far] = near_far_m(config.scene);
     let [width, height] = largest_px;
-    let (lamps, ambient) = light::mjcf();
+    let (lamps, ambient) = light::mjcf(brightness(config.scene));
     let robot = robot(config);
     let xml = format!(
         "<mujoco model=\"{}\">\n\
