@@ -43,9 +43,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         "mobile-arm" => {
             config.scene = sim::Scene::MobileArm;
             config.light_inside_frac = 0.6;
-            let camera = &mut config.cameras[0];
-            camera.intrinsics = camera.intrinsics.resized([1280, 720]);
-            camera.intrinsics.focal_px = [905.0, 904.0];
+            config.cameras = vec![CameraConfig::mobile_wrist("wrist")];
+            config.cameras[0].rate_hz = 1.0;
         }
         _ => {}
     }

@@ -32,7 +32,7 @@ const LEAVES_SECS: f64 = 14.0;
 const WALKS_SECS: f64 = 5.0;
 /// The stands: x, y and heading, metres and radians.
 const FAR_STAND: [f64; 3] = [0.0, 0.15, -0.06];
-const NEAR_STAND: [f64; 3] = [1.28, 0.0, 0.02];
+const NEAR_STAND: [f64; 3] = [1.15, 0.0, 0.02];
 
 /// Where the arm stands on the quadruped's back; `mount` in the URDFs.
 pub(crate) fn base_from_arm() -> Transform {

@@ -234,19 +234,48 @@ impl CameraConfig {
             },
             rate_hz: 15.0,
             parent: Parent::Flange,
-            parent_from_camera: wrist_mount(),
+            parent_from_camera: wrist_mount(50.0),
             sensor: SensorConfig::default(),
             depth: Some(DepthConfig::default()),
         }
     }
+
+    /// A wrist RGB-D camera like a `RealSense` L515 for what stands upright before the arm: 1280x720 colour at 4 Hz, depth of
+    /// 640x480 with a lens and a place of its own, tilted by 80 degrees.
+    pub fn mobile_wrist(name: &str) -> Self {
+        let pinhole = |size_px, focal_px, principal_px| Intrinsics {
+            size_px,
+            focal_px,
+            principal_px,
+            lens: Lens::Pinhole,
+            rectified: false,
+        };
+        Self {
+            intrinsics: pinhole([1280, 720], [905.3, 904.7], [648.2, 355.1]),
+            rate_hz: 4.0,
+            parent_from_camera: wrist_mount(80.0),
+            depth: Some(DepthConfig {
+                sensor: Some(DepthSensor {
+                    intrinsics: pinhole([640, 480], [461.2, 461.5], [324.6, 236.9]),
+                    camera_from_depth: Transform::translation(0.001, -0.0141, -0.004),
+                }),
+                noise_sigma_m: 0.0025,
+                min_m: 0.15,
+                max_m: 2.6,
+                metres_per_count: 0.00025,
+                ..DepthConfig::default()
+            }),
+            ..Self::wrist(name)
+        }
+    }
 }
 
-/// The bracket of the wrist camera, as `flange_from_camera`: beside the flange, tilted by 50 degrees to look past it.
+/// The bracket of the wrist camera, as `flange_from_camera`: beside the flange, tilted to look past it.
 ///
 /// The tilt lets the arm look at the scene from low elevations without reaching its joint limits.
-fn wrist_mount() -> Transform {
+fn wrist_mount(tilt_degrees: f64) -> Transform {
     let quarter = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2);
-    let tilt = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), 50f64.to_radians());
+    let tilt = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), tilt_degrees.to_radians());
     Transform::from_parts(Translation3::new(0.06, 0.0, 0.045), quarter * tilt)
 }
 

@@ -6,7 +6,7 @@ use drivers::{BasePose, Image, PixelFormat, RangeScan, Sample, Source, TruthImag
 use kinematics::{Intrinsics, Transform};
 use nalgebra::{Isometry3, Point3, Vector3};
 use sim::layout::{ROOM_HALF_M, ROOM_HEIGHT_M};
-use sim::{CameraConfig, Config, DepthSensor, Parent, ScannerConfig, Scene};
+use sim::{CameraConfig, Config, Parent, ScannerConfig, Scene};
 
 #[derive(Default, PartialEq)]
 struct Run {
@@ -69,20 +69,12 @@ fn mobile_base(rate_hz: f64) -> Config {
 /// A small wrist camera whose depth has its own lens and place.
 fn mobile_arm(rate_hz: f64) -> Config {
     let mut config = Config { scene: Scene::MobileArm, truth_depth: true, light_inside_frac: 0.6, ..Config::default() };
+    config.cameras = vec![CameraConfig::mobile_wrist("wrist")];
     let camera = &mut config.cameras[0];
     camera.intrinsics = camera.intrinsics.resized([320, 180]);
-    camera.intrinsics.focal_px = [226.3, 226.2];
     camera.rate_hz = rate_hz;
-    let lens =
-        Intrinsics { size_px: [160, 120], focal_px: [115.3, 115.4], principal_px: [81.2, 59.2], ..lens_of(&config) };
-    let depth_sensor =
-        DepthSensor { intrinsics: lens, camera_from_depth: Isometry3::translation(0.001, -0.0141, -0.004) };
-    config.cameras[0].depth = Some(sim::DepthConfig {
-        sensor: Some(depth_sensor),
-        metres_per_count: 0.00025,
-        max_m: 2.6,
-        ..config.cameras[0].depth.take().expect("the wrist has depth")
-    });
+    let sensor = camera.depth.as_mut().and_then(|depth| depth.sensor.as_mut()).expect("a depth sensor of its own");
+    sensor.intrinsics = sensor.intrinsics.resized([160, 120]);
     config
 }
 
