@@ -9,12 +9,15 @@
 # One feature set everywhere, so that dependencies compile once.
 FEATURES := --features sim
 
+# The rig that `make demo` simulates: a file of the folder rigs.
+RIG ?= static-arm
+
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: deps web ## Simulate the static arm and serve the growing scene; needs no display
+demo: deps web ## Simulate a rig (RIG=static-arm, mobile-arm, mobile-base-small, ...) and serve the growing scene; needs no display
 	cargo build --release $(FEATURES)
-	target/release/fieldrig run rigs/static-arm.toml --sim
+	target/release/fieldrig run rigs/$(RIG).toml --sim
 
 test: check web ## Lints, documentation and every test that needs no device
 	cargo test --workspace $(FEATURES) --no-fail-fast

@@ -2,10 +2,10 @@
 
 use crate::config::{Camera, Measured, Rig};
 use crate::exit::BadArgument;
-use anyhow::{Context, ensure};
+use anyhow::Context;
 use kinematics::{Chain, Intrinsics, Transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use trainer::align::{Alignment, Found};
 use trainer::splat::CameraFix;
 
@@ -32,23 +32,32 @@ pub(crate) fn corrected(rig: &Rig, alignment: &Alignment) -> anyhow::Result<Rig>
 }
 
 /// Refuses a place where no file can be written.
-pub(crate) fn refuse_place(file: &Path) -> Result<(), BadArgument> {
+pub(crate) fn refuse_place(rig: &Rig, file: &Path) -> Result<(), BadArgument> {
     let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    if folder.is_dir() && !file.is_dir() {
-        return Ok(());
+    if !folder.is_dir() || file.is_dir() {
+        return Err(BadArgument(format!("--write-rig {}: must be a file in a folder that exists", file.display())));
     }
-    Err(BadArgument(format!("--write-rig {}: must be a file in a folder that exists", file.display())))
+    match other_robot(rig, file) {
+        Some(urdf) => Err(BadArgument(format!(
+            "--write-rig {}: {} is another robot's description; the rig file wants a folder of its own",
+            file.display(),
+            urdf.display()
+        ))),
+        None => Ok(()),
+    }
+}
+
+/// The robot's description beside a rig file, where it is of another robot.
+fn other_robot(rig: &Rig, file: &Path) -> Option<PathBuf> {
+    let urdf = file.with_file_name(drivers::recording::URDF_FILE);
+    let there = std::fs::read_to_string(&urdf).ok()?;
+    (there != rig.arm.urdf_text).then_some(urdf)
 }
 
 /// Writes a rig file, and the robot's description beside it, where no other one lies.
 pub(crate) fn write(rig: &Rig, file: &Path) -> anyhow::Result<()> {
+    refuse_place(rig, file)?;
     let urdf = file.with_file_name(drivers::recording::URDF_FILE);
-    let there = std::fs::read_to_string(&urdf).ok();
-    ensure!(
-        there.is_none_or(|text| text == rig.arm.urdf_text),
-        "{} is another robot's description; the rig file wants a folder of its own",
-        urdf.display()
-    );
     let in_file = || format!("cannot write {}", file.display());
     std::fs::write(&urdf, &rig.arm.urdf_text).with_context(in_file)?;
     std::fs::write(file, rig.to_toml()).with_context(in_file)
@@ -156,9 +165,10 @@ mod tests {
         let file = folder.path().join("rig.toml");
         write(&found, &file).unwrap();
         assert_eq!(Rig::load(&file, &[]).unwrap(), found);
+        assert!(Rig::load(&file, &[]).unwrap().sees_like(&found) && !rig.sees_like(&found));
         std::fs::write(folder.path().join(drivers::recording::URDF_FILE), "<robot/>").unwrap();
         assert!(write(&found, &file).unwrap_err().to_string().contains("another robot"));
-        assert!(refuse_place(&folder.path().join("none/rig.toml")).is_err());
-        assert!(refuse_place(&file).is_ok());
+        assert!(refuse_place(&found, &folder.path().join("none/rig.toml")).is_err());
+        assert!(refuse_place(&found, &file).unwrap_err().to_string().contains("another robot"), "before training, too");
     }
 }

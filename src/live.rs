@@ -13,7 +13,7 @@ const PUBLISH_EVERY: Duration = Duration::from_millis(250);
 /// Where there is nothing to do, this long is waited for something.
 const IDLE: Duration = Duration::from_millis(10);
 /// Share of the time that goes into scores between the marks.
-const SCORE_FRAC: f64 = 0.1;
+const SCORE_FRAC: f64 = 0.03;
 /// A slice of training this short still leaves this much to the renders.
 const LEAST_RENDER_TIME: Duration = Duration::from_millis(10);
 

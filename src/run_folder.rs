@@ -13,6 +13,8 @@ use trainer::{Keyframe, Method};
 const MODEL_FILES: [&str; 5] = ["model.json", "mesh.ply", "mesh.glb", "field.blocks", "splats.ply"];
 /// Where a model lies until it is whole.
 const UNFINISHED: &str = "model.part";
+/// Held while a run writes into a folder.
+const LOCK: &str = ".lock";
 const SECS_PER_DAY: u64 = 86_400;
 
 /// Refuses a folder that holds a model: results of two runs never mix, and none is replaced.
@@ -29,8 +31,14 @@ pub(crate) fn refuse_model(folder: &Path) -> Result<(), BadArgument> {
 /// Makes the folder asked for, or `runs/<UTC time>`; one that holds a model is refused.
 pub(crate) fn make(asked: Option<&Path>) -> anyhow::Result<PathBuf> {
     if let Some(folder) = asked {
+        if folder.to_str().is_none() {
+            return Err(
+                BadArgument(format!("--out {}: the name must be UTF-8, reports hold it", folder.display())).into()
+            );
+        }
         refuse_model(folder)?;
         std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
+        lock(folder)?;
         return Ok(folder.to_owned());
     }
     #[expect(clippy::disallowed_methods, reason = "a name for people; nothing is measured by it")]
@@ -43,12 +51,30 @@ pub(crate) fn make(asked: Option<&Path>) -> anyhow::Result<PathBuf> {
             _ => PathBuf::from(format!("runs/{name}-{attempt}")),
         };
         match std::fs::create_dir(&folder) {
-            Ok(()) => return Ok(folder),
+            Ok(()) => {
+                lock(&folder)?;
+                return Ok(folder);
+            }
             Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
             Err(error) => return Err(error).with_context(|| format!("cannot make the folder {}", folder.display())),
         }
     }
     anyhow::bail!("runs/{name} and ninety-eight more exist already: name a folder with --out")
+}
+
+/// Keeps other runs out of a folder as long as this process lives.
+fn lock(folder: &Path) -> anyhow::Result<()> {
+    let place = folder.join(LOCK);
+    let file = std::fs::File::create(&place).with_context(|| format!("cannot write {}", place.display()))?;
+    match file.try_lock() {
+        Ok(()) => std::mem::forget(file), // The system lets go of it when the process ends, however it ends.
+        Err(std::fs::TryLockError::WouldBlock) => {
+            let told = format!("--out {}: another run writes into this folder, name another one", folder.display());
+            return Err(BadArgument(told).into());
+        }
+        Err(std::fs::TryLockError::Error(error)) => log::debug!("{}: no lock: {error}", place.display()),
+    }
+    Ok(())
 }
 
 /// Saves a model beside its place first and moves it there when it is whole.
@@ -138,6 +164,14 @@ mod tests {
         std::fs::write(folder.path().join("model.json"), b"{}").expect("file");
         let told = make(Some(folder.path())).expect_err("a model").to_string();
         assert!(told.contains(folder.path().to_str().expect("plain")) && told.contains("model.json"), "{told}");
+    }
+
+    #[test]
+    fn two_runs_do_not_write_into_one_folder() {
+        let folder = tempfile::tempdir().expect("folder");
+        make(Some(folder.path())).expect("the first");
+        let told = make(Some(folder.path())).expect_err("the second").to_string();
+        assert!(told.contains("another run writes into this folder"), "{told}");
     }
 
     #[test]

@@ -20,7 +20,8 @@ impl Image {
         }
     }
 
-    /// Decodes a depth image to `[height, width]`, metres along the camera's z axis; 0 where the sensor saw nothing.
+    /// Decodes a depth image to `[height, width]`, metres along the camera's z axis; 0 where the sensor saw nothing. The
+    /// largest count says that the reading was larger still: nothing is known there either.
     pub fn decode_depth_m(&self) -> Result<Vec<f32>, Error> {
         let PixelFormat::DepthU16 { metres_per_count } = self.format else {
             return Err(self.wrong_kind("depth"));
@@ -29,8 +30,10 @@ impl Image {
             clippy::cast_possible_truncation,
             reason = "16-bit counts keep more digits in f32 than the sensor has"
         )]
-        let metres_from_count =
-            |count: &[u8]| (f64::from(u16::from_le_bytes([count[0], count[1]])) * metres_per_count) as f32;
+        let metres_from_count = |count: &[u8]| match u16::from_le_bytes([count[0], count[1]]) {
+            u16::MAX => 0.0,
+            count => (f64::from(count) * metres_per_count) as f32,
+        };
         Ok(self.bytes_of(2)?.chunks_exact(2).map(metres_from_count).collect())
     }
 
@@ -110,9 +113,13 @@ mod tests {
     }
 
     #[test]
-    fn depth_counts_become_metres_and_zero_stays_zero() {
-        let depth = image(PixelFormat::DepthU16 { metres_per_count: 1e-4 }, [3, 1], &[0, 0, 0x10, 0x27, 0xff, 0xff]);
-        assert_eq!(depth.decode_depth_m().expect("depth"), [0.0, 1.0, 6.5535]);
+    fn depth_counts_become_metres_and_what_is_not_known_is_zero() {
+        let depth = image(
+            PixelFormat::DepthU16 { metres_per_count: 1e-4 },
+            [4, 1],
+            &[0, 0, 0x10, 0x27, 0xfe, 0xff, 0xff, 0xff],
+        );
+        assert_eq!(depth.decode_depth_m().expect("depth"), [0.0, 1.0, 6.5534, 0.0]);
     }
 
     #[test]

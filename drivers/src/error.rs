@@ -40,6 +40,20 @@ pub enum Error {
         /// How long the call waited.
         waited: Duration,
     },
+    /// A base stayed silent.
+    #[error("base: no pose within {waited:?}")]
+    NoBasePose {
+        /// How long the call waited.
+        waited: Duration,
+    },
+    /// A range scanner stayed silent.
+    #[error("range scanner {scanner:?}: no scan within {waited:?}")]
+    NoScan {
+        /// Name of the scanner.
+        scanner: String,
+        /// How long the call waited.
+        waited: Duration,
+    },
     /// A simulated device failed.
     #[error("simulated rig: {reason}")]
     Simulation {

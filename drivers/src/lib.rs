@@ -9,8 +9,8 @@ mod sample;
 pub mod wire;
 
 pub use error::{Error, Kept};
-pub use live::Live;
-pub use sample::{BasePose, Image, PixelFormat, Sample, TruthImage};
+pub use live::{Devices, Live};
+pub use sample::{BasePose, Image, PixelFormat, RangePoint, RangeScan, Sample, TruthImage};
 
 use kinematics::{Intrinsics, JointState};
 use std::time::Duration;
@@ -33,6 +33,20 @@ pub trait Arm: Send {
     fn joint_names(&self) -> &[String];
     /// Waits for the next joint state this call has not returned yet.
     fn read(&mut self, timeout: Duration) -> Result<JointState, Error>;
+}
+
+/// Whatever tells where the robot's base is.
+pub trait Base: Send {
+    /// Waits for the next pose this call has not returned yet, in stamp order.
+    fn next_pose(&mut self, timeout: Duration) -> Result<BasePose, Error>;
+}
+
+/// A live source of range scans from one scanner, real, simulated or replayed.
+pub trait RangeScanner: Send {
+    /// Name in the rig file; also the name of its frame.
+    fn name(&self) -> &str;
+    /// Waits for the next scan this call has not returned yet, in stamp order; a slow caller loses the oldest.
+    fn next_scan(&mut self, timeout: Duration) -> Result<RangeScan, Error>;
 }
 
 /// Anything that yields samples of a whole rig in one deterministic order: a recording, a lockstep simulation, live devices.

@@ -1,6 +1,6 @@
 //! Live devices as one source of samples: a thread a device, a bounded queue between it and the caller.
 
-use crate::{Arm, Camera, Error, Image, Sample, Source};
+use crate::{Arm, Base, Camera, Error, Image, RangeScanner, Sample, Source};
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
@@ -10,15 +10,30 @@ use std::time::Duration;
 const MAX_IMAGES: usize = 8;
 /// Joint readings that may wait: one second at 1 kHz.
 const MAX_JOINTS: usize = 1000;
+/// Range scans of one scanner that may wait.
+const MAX_SCANS: usize = 20;
 /// A device that says nothing for this long is an error.
 const MAX_SILENCE: Duration = Duration::from_secs(5);
 /// How long one wait on a device lasts, and so how soon its thread notices that it is to stop.
 const POLL: Duration = Duration::from_millis(100);
 
+/// The devices of a rig.
+#[derive(Default)]
+pub struct Devices {
+    /// Cameras.
+    pub cameras: Vec<Box<dyn Camera>>,
+    /// The arm, where there is one.
+    pub arm: Option<Box<dyn Arm>>,
+    /// What tells where the base is, where it moves.
+    pub base: Option<Box<dyn Base>>,
+    /// Range scanners.
+    pub scanners: Vec<Box<dyn RangeScanner>>,
+}
+
 /// All devices of a rig, read by a thread each.
 ///
 /// A slow caller loses the oldest samples of a device: images are counted in [`Image::n_skipped`] of the next image of the
-/// same kind, joint readings in [`Live::n_joints_dropped`]. The first error of a device is returned once by
+/// same kind, everything else in [`Live::n_others_dropped`]. The first error of a device is returned once by
 /// [`Source::next_sample`] and ends the source. Dropping it stops the threads.
 #[derive(Debug)]
 pub struct Live {
@@ -38,7 +53,7 @@ struct State {
     queues: Vec<VecDeque<Sample>>,
     /// Images dropped and not yet told, by device: colour and depth.
     dropped: Vec<[u64; 2]>,
-    n_joints_dropped: u64,
+    n_others_dropped: u64,
     error: Option<Error>,
     failed: bool,
     n_running: usize,
@@ -47,8 +62,9 @@ struct State {
 
 impl Live {
     /// Starts reading.
-    pub fn new(cameras: Vec<Box<dyn Camera>>, arm: Option<Box<dyn Arm>>) -> Result<Self, Error> {
-        let n_devices = cameras.len() + usize::from(arm.is_some());
+    pub fn new(devices: Devices) -> Result<Self, Error> {
+        let Devices { cameras, arm, base, scanners } = devices;
+        let n_devices = cameras.len() + usize::from(arm.is_some()) + usize::from(base.is_some()) + scanners.len();
         let state = State {
             queues: vec![VecDeque::new(); n_devices],
             dropped: vec![[0; 2]; n_devices],
@@ -59,42 +75,57 @@ impl Live {
             shared: Arc::new(Shared { state: Mutex::new(state), arrived: Condvar::new() }),
             threads: Vec::new(),
         };
-        let n_cameras = cameras.len();
-        for (device_ix, mut camera) in cameras.into_iter().enumerate() {
+        for mut camera in cameras {
             let name = camera.name().to_owned();
-            live.spawn(format!("camera {name:?}"), move |shared| {
-                read_until_stopped(
-                    shared,
-                    device_ix,
-                    MAX_IMAGES,
-                    || match camera.next_image(POLL) {
-                        Err(Error::NoImage { .. }) => Ok(None),
-                        image => image.map(Sample::Image).map(Some),
-                    },
-                    |waited| Error::NoImage { camera: name.clone(), waited },
-                );
+            let silent = move |waited| Error::NoImage { camera: name.clone(), waited };
+            live.read(format!("camera {:?}", camera.name()), MAX_IMAGES, silent, move || {
+                match camera.next_image(POLL) {
+                    Err(Error::NoImage { .. }) => Ok(None),
+                    image => image.map(Sample::Image).map(Some),
+                }
             })?;
         }
         if let Some(mut arm) = arm {
-            live.spawn("arm".to_owned(), move |shared| {
-                read_until_stopped(
-                    shared,
-                    n_cameras,
-                    MAX_JOINTS,
-                    || match arm.read(POLL) {
-                        Err(Error::NoJoints { .. }) => Ok(None),
-                        state => state.map(Sample::Joints).map(Some),
-                    },
-                    |waited| Error::NoJoints { waited },
-                );
+            let silent = |waited| Error::NoJoints { waited };
+            live.read("arm".to_owned(), MAX_JOINTS, silent, move || match arm.read(POLL) {
+                Err(Error::NoJoints { .. }) => Ok(None),
+                state => state.map(Sample::Joints).map(Some),
+            })?;
+        }
+        if let Some(mut base) = base {
+            let silent = |waited| Error::NoBasePose { waited };
+            live.read("base".to_owned(), MAX_JOINTS, silent, move || match base.next_pose(POLL) {
+                Err(Error::NoBasePose { .. }) => Ok(None),
+                pose => pose.map(Sample::Base).map(Some),
+            })?;
+        }
+        for mut scanner in scanners {
+            let name = scanner.name().to_owned();
+            let silent = move |waited| Error::NoScan { scanner: name.clone(), waited };
+            let device = format!("range scanner {:?}", scanner.name());
+            live.read(device, MAX_SCANS, silent, move || match scanner.next_scan(POLL) {
+                Err(Error::NoScan { .. }) => Ok(None),
+                scan => scan.map(Sample::Range).map(Some),
             })?;
         }
         Ok(live)
     }
 
-    /// Joint readings lost so far because the caller was slow.
-    pub fn n_joints_dropped(&self) -> u64 {
-        self.shared.lock().n_joints_dropped
+    /// Starts the thread of the next device.
+    fn read(
+        &mut self,
+        device: String,
+        max_waiting: usize,
+        silent: impl Fn(Duration) -> Error + Send + 'static,
+        read: impl FnMut() -> Result<Option<Sample>, Error> + Send + 'static,
+    ) -> Result<(), Error> {
+        let device_ix = self.threads.len();
+        self.spawn(device, move |shared| read_until_stopped(shared, device_ix, max_waiting, read, silent))
+    }
+
+    /// Joint readings, base poses and range scans lost so far because the caller was slow.
+    pub fn n_others_dropped(&self) -> u64 {
+        self.shared.lock().n_others_dropped
     }
 
     fn spawn(&mut self, device: String, read: impl FnOnce(&Shared) + Send + 'static) -> Result<(), Error> {
@@ -159,7 +190,7 @@ impl State {
         if self.queues[device_ix].len() >= max_waiting {
             match self.queues[device_ix].pop_front() {
                 Some(Sample::Image(lost)) => self.tell_loss(device_ix, &lost, &mut sample),
-                Some(_) => self.n_joints_dropped += 1,
+                Some(_) => self.n_others_dropped += 1,
                 None => {}
             }
         }
@@ -288,7 +319,7 @@ mod tests {
 
     #[test]
     fn a_slow_caller_gets_the_newest_images_and_the_count_of_the_lost_ones() {
-        let mut live = Live::new(vec![fast(101)], None).expect("threads start");
+        let mut live = Live::new(Devices { cameras: vec![fast(101)], ..Devices::default() }).expect("threads start");
         while live.shared.lock().n_running > 0 {
             std::thread::yield_now();
         }
@@ -306,7 +337,8 @@ mod tests {
 
     #[test]
     fn joints_and_images_come_in_stamp_order_and_dropping_stops_the_threads() {
-        let mut live = Live::new(vec![], Some(Box::new(Still { next: 0 }))).expect("threads start");
+        let mut live =
+            Live::new(Devices { arm: Some(Box::new(Still { next: 0 })), ..Devices::default() }).expect("threads start");
         let stamps: Vec<_> =
             (0..3).map(|_| live.next_sample().expect("alive").expect("three readings").stamp()).collect();
         assert_eq!(stamps, [Stamp(1), Stamp(2), Stamp(3)]);

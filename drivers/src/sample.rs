@@ -62,6 +62,28 @@ pub struct TruthImage {
     pub psnr_ceiling: Option<f64>,
 }
 
+/// One echo of a range scanner.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RangePoint {
+    /// Where the surface was in the sensor's frame (x ahead, z up) at the instant of this point, metres.
+    pub position_m: [f32; 3],
+    /// Which of the scanner's rings measured it, from the lowest.
+    pub ring: u16,
+    /// From the stamp of the scan to this point, microseconds.
+    pub offset_micros: u32,
+}
+
+/// One turn of a range scanner; directions without an echo have no point.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RangeScan {
+    /// Name of the scanner in the rig file; also the name of its frame.
+    pub scanner: Arc<str>,
+    /// When the turn began.
+    pub stamp: Stamp,
+    /// In the order in which they were measured. The scanner may move in between: each is told where the sensor was then.
+    pub points: Arc<[RangePoint]>,
+}
+
 /// One delivery of one device.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Sample {
@@ -71,6 +93,10 @@ pub enum Sample {
     Joints(JointState),
     /// Base pose.
     Base(BasePose),
+    /// One turn of a range scanner.
+    Range(RangeScan),
+    /// Where a simulated base truly was when it told a pose.
+    BaseTruth(BasePose),
     /// Ground truth of a simulated image.
     Truth(TruthImage),
 }
@@ -81,7 +107,8 @@ impl Sample {
         match self {
             Self::Image(image) => image.stamp,
             Self::Joints(state) => state.stamp,
-            Self::Base(pose) => pose.stamp,
+            Self::Base(pose) | Self::BaseTruth(pose) => pose.stamp,
+            Self::Range(scan) => scan.stamp,
             Self::Truth(truth) => truth.image.stamp,
         }
     }

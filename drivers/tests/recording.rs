@@ -1,7 +1,7 @@
 //! Samples to a file and back: nothing changes, nothing is reordered, and a damaged file gives what is left of it.
 
 use drivers::recording::{About, RIG_FILE, Recorder, Recording};
-use drivers::{BasePose, Error, Image, PixelFormat, Sample, Source, TruthImage};
+use drivers::{BasePose, Error, Image, PixelFormat, RangePoint, RangeScan, Sample, Source, TruthImage};
 use kinematics::{Intrinsics, JointState, Lens, Stamp, Transform};
 use nalgebra::{Translation3, UnitQuaternion};
 use std::path::Path;
@@ -45,6 +45,17 @@ fn samples() -> Vec<Sample> {
             let truth = TruthImage { image, depth_m: depth_m.into(), world_from_camera, psnr_ceiling };
             samples.extend([Sample::Image(color), Sample::Truth(truth), Sample::Image(depth)]);
             samples.push(Sample::Base(BasePose { stamp, world_from_base: world_from_camera.inverse() }));
+            samples.push(Sample::BaseTruth(BasePose { stamp, world_from_base: world_from_camera }));
+            let point = |ring: u16| RangePoint {
+                position_m: [0.1, -f32::from(ring), 3.7],
+                ring,
+                offset_micros: 55 * u32::from(ring),
+            };
+            samples.push(Sample::Range(RangeScan {
+                scanner: "lidar".into(),
+                stamp,
+                points: (0..16).map(point).collect(),
+            }));
         }
     }
     samples

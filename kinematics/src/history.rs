@@ -1,6 +1,6 @@
 //! What the joints and the base were at a given instant: interpolated between readings, never beyond them.
 
-use crate::{JointState, Stamp, Transform, transform};
+use crate::{JointState, Stamp, Transform, Twist, transform};
 use std::collections::VecDeque;
 use std::time::Duration;
 
@@ -254,6 +254,20 @@ impl PoseHistory {
             1.0 => *b,
             _ => transform::interpolate(a, b, frac),
         })
+    }
+
+    /// The pose at a stamp and the body's velocity there: the constant one between the neighbouring poses, in the body's axes
+    /// at the stamp; zero where a pose has no neighbour near enough.
+    pub fn with_twist_at(&self, stamp: Stamp) -> Result<(Transform, Twist), HistoryError> {
+        let Between { before: (before, a), after: (after, b), .. } = self.readings.around(stamp)?;
+        let pose = self.at(stamp)?;
+        let span_secs = after.secs_since(before);
+        if span_secs <= 0.0 {
+            return Ok((pose, Twist::zero()));
+        }
+        let velocity_m_s = (b.translation.vector - a.translation.vector) / span_secs;
+        let angular_rad_s = (a.rotation.inverse() * b.rotation).scaled_axis() / span_secs;
+        Ok((pose, Twist { linear_m_s: pose.rotation.inverse() * velocity_m_s, angular_rad_s }))
     }
 
     /// Stamp of the newest pose.

@@ -1,6 +1,6 @@
 //! Plays the default rig and writes its pictures into a folder, to look at and to time.
 //!
-//! `cargo run --release -p sim --example look -- FOLDER N_IMAGES [EVERY] [720p|two|notruth|global|ideal]`
+//! `cargo run --release -p sim --example look -- FOLDER N_IMAGES [EVERY] [720p|two|notruth|global|ideal|mobile-base|mobile-arm]`
 
 use drivers::{PixelFormat, Sample, Source};
 use nalgebra::{Isometry3, Point3, Vector3};
@@ -39,12 +39,19 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             config.cameras[0].sensor.readout_micros = 0.0;
         }
         "ideal" => config.ideal = true,
+        "mobile-base" => mobile_base(&mut config),
+        "mobile-arm" => {
+            config.scene = sim::Scene::MobileArm;
+            config.light_inside_frac = 0.6;
+            config.cameras = vec![CameraConfig::mobile_wrist("wrist")];
+            config.cameras[0].rate_hz = 1.0;
+        }
         _ => {}
     }
     let began = Instant::now();
     let mut rig = sim::open(&config)?.into_lockstep();
     let opened = began.elapsed();
-    let mut n_taken = 0;
+    let (mut n_taken, mut n_points) = (0, 0);
     let mut ceiling = 0.0;
     let began = Instant::now();
     while let Some(sample) = rig.next_sample()? {
@@ -76,14 +83,46 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                     image::save_buffer(file, &truth.image.data, width, height, image::ExtendedColorType::Rgb8)?;
                 }
             }
-            Sample::Joints(_) | Sample::Base(_) => {}
+            Sample::Range(scan) => n_points += scan.points.len(),
+            Sample::Joints(_) | Sample::Base(_) | Sample::BaseTruth(_) => {}
         }
     }
     let millis = began.elapsed().as_secs_f64() * 1e3 / n_taken as f64;
     eprintln!(
-        "{}: opened in {opened:?}, {millis:.1} ms an image, mean PSNR ceiling {:.2} dB",
+        "{}: opened in {opened:?}, {millis:.1} ms an image, mean PSNR ceiling {:.2} dB, {n_points} echoes",
         rig.info().renderer,
         ceiling / n_taken as f64
     );
     Ok(())
+}
+
+/// Cameras ahead and behind, and a scanner.
+fn mobile_base(config: &mut Config) {
+    config.scene = sim::Scene::MobileBase;
+    (config.joint_names, config.reading_order) = (Vec::new(), Vec::new());
+    config.cameras.clear();
+    for (name, x, ahead) in [("front", 0.43, 1.0), ("rear", -0.40, -1.0)] {
+        let mut camera = CameraConfig::wrist(name);
+        camera.intrinsics = camera.intrinsics.resized([1280, 720]);
+        camera.intrinsics.focal_px = [640.0, 640.0];
+        camera.parent = Parent::Base;
+        let eye = Point3::new(x, 0.0, 0.06);
+        camera.parent_from_camera =
+            Isometry3::face_towards(&eye, &(eye + Vector3::new(ahead, 0.0, 0.05)), &-Vector3::z());
+        camera.depth = None;
+        camera.rate_hz = 1.0;
+        config.cameras.push(camera);
+    }
+    config.scanners.push(sim::ScannerConfig {
+        name: "lidar".to_owned(),
+        rate_hz: 10.0,
+        base_from_scanner: Isometry3::translation(-0.2, 0.0, 0.2),
+        n_rings: 16,
+        elevation_rad: [-0.2618, 0.2618],
+        n_columns: 900,
+        min_m: 0.4,
+        max_m: 50.0,
+        noise_sigma_m: 0.02,
+        dropped_frac: 0.01,
+    });
 }

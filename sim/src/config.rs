@@ -31,6 +31,55 @@ pub struct Config {
     pub reading_order: Vec<String>,
     /// The cameras, each with its own name.
     pub cameras: Vec<CameraConfig>,
+    /// The range scanners, each with its own name.
+    pub scanners: Vec<ScannerConfig>,
+    /// What is told of a base that moves.
+    pub base: BaseConfig,
+    /// Brightness of all lamps once the arm's camera is inside the cabinet, relative to outside; 1 changes nothing.
+    pub light_inside_frac: f64,
+}
+
+/// What a scene's moving base tells about itself.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BaseConfig {
+    /// Poses a second.
+    pub rate_hz: f64,
+    /// Root mean square of the error of the told position at the end of the walk (one lap, or the last stand), metres. The error
+    /// grows with the square root of the way.
+    pub drift_m: f64,
+    /// The same of the told orientation, radians.
+    pub drift_rad: f64,
+}
+
+impl Default for BaseConfig {
+    fn default() -> Self {
+        Self { rate_hz: 100.0, drift_m: 0.02, drift_rad: 0.0175 }
+    }
+}
+
+/// One simulated range scanner that turns about its z axis, fixed to the base.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ScannerConfig {
+    /// Name in the rig file.
+    pub name: String,
+    /// Turns a second.
+    pub rate_hz: f64,
+    /// Pose on the base: x ahead, z up.
+    pub base_from_scanner: Transform,
+    /// Rings, spread evenly over the elevations.
+    pub n_rings: u32,
+    /// Lowest and highest ring, radians above the sensor's xy plane.
+    pub elevation_rad: [f64; 2],
+    /// Directions of each ring a turn.
+    pub n_columns: u32,
+    /// Nearer and further surfaces give no echo, metres.
+    pub min_m: f64,
+    /// See `min_m`.
+    pub max_m: f64,
+    /// Standard deviation of the range, metres.
+    pub noise_sigma_m: f64,
+    /// Share of the echoes that are lost.
+    pub dropped_frac: f64,
 }
 
 /// The scenes that can be built.
@@ -38,16 +87,32 @@ pub struct Config {
 pub enum Scene {
     /// A Panda on a table between two walls; a furry toy, a tag cube and a wooden block.
     StaticArm,
+    /// A quadruped walks round a wooden pedestal with a glass bowl in a laboratory of 15 x 10 m.
+    MobileBase,
+    /// A Panda on a quadruped before a switchboard cabinet, first 2 m off, then close and into it.
+    MobileArm,
 }
 
 impl Scene {
     /// Every scene.
-    pub const ALL: [Self; 1] = [Self::StaticArm];
+    pub const ALL: [Self; 3] = [Self::StaticArm, Self::MobileBase, Self::MobileArm];
+
+    /// Whether the robot has an arm.
+    pub fn has_arm(self) -> bool {
+        self != Self::MobileBase
+    }
+
+    /// Whether the robot's base moves and tells where it is.
+    pub fn has_moving_base(self) -> bool {
+        self != Self::StaticArm
+    }
 
     /// Name in the rig file.
     pub fn name(self) -> &'static str {
         match self {
             Self::StaticArm => "static-arm",
+            Self::MobileBase => "mobile-base",
+            Self::MobileArm => "mobile-arm",
         }
     }
 
@@ -62,6 +127,8 @@ impl Scene {
 pub enum Parent {
     /// The arm's flange: the camera moves with it.
     Flange,
+    /// The robot's base.
+    Base,
     /// The world: the camera stands still.
     World,
 }
@@ -71,7 +138,7 @@ pub enum Parent {
 pub struct CameraConfig {
     /// Name in the rig file.
     pub name: String,
-    /// True lens parameters and image size; depth is registered to them.
+    /// True lens parameters and image size.
     pub intrinsics: Intrinsics,
     /// Images a second.
     pub rate_hz: f64,
@@ -122,8 +189,10 @@ impl Default for SensorConfig {
 }
 
 /// Flaws and limits of depth images, which come with the stamp of the colour image and a global shutter.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct DepthConfig {
+    /// Where depth has a lens and a place of its own; else it is registered to the colour image.
+    pub sensor: Option<DepthSensor>,
     /// Standard deviation at 1 m, metres; grows with the square of the depth.
     pub noise_sigma_m: f64,
     /// Share of the pixels without depth, most of them where depth jumps.
@@ -136,9 +205,18 @@ pub struct DepthConfig {
     pub metres_per_count: f64,
 }
 
+/// A depth sensor beside the colour sensor.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DepthSensor {
+    /// Lens parameters and size of the depth images.
+    pub intrinsics: Intrinsics,
+    /// Its pose in the frame of the colour camera.
+    pub camera_from_depth: Transform,
+}
+
 impl Default for DepthConfig {
     fn default() -> Self {
-        Self { noise_sigma_m: 0.0015, hole_frac: 0.02, min_m: 0.1, max_m: 6.0, metres_per_count: 1e-4 }
+        Self { sensor: None, noise_sigma_m: 0.0015, hole_frac: 0.02, min_m: 0.1, max_m: 6.0, metres_per_count: 1e-4 }
     }
 }
 
@@ -156,19 +234,48 @@ impl CameraConfig {
             },
             rate_hz: 15.0,
             parent: Parent::Flange,
-            parent_from_camera: wrist_mount(),
+            parent_from_camera: wrist_mount(50.0),
             sensor: SensorConfig::default(),
             depth: Some(DepthConfig::default()),
         }
     }
+
+    /// A wrist RGB-D camera like a `RealSense` L515 for what stands upright before the arm: 1280x720 colour at 4 Hz, depth of
+    /// 640x480 with a lens and a place of its own, tilted by 80 degrees.
+    pub fn mobile_wrist(name: &str) -> Self {
+        let pinhole = |size_px, focal_px, principal_px| Intrinsics {
+            size_px,
+            focal_px,
+            principal_px,
+            lens: Lens::Pinhole,
+            rectified: false,
+        };
+        Self {
+            intrinsics: pinhole([1280, 720], [905.3, 904.7], [648.2, 355.1]),
+            rate_hz: 4.0,
+            parent_from_camera: wrist_mount(80.0),
+            depth: Some(DepthConfig {
+                sensor: Some(DepthSensor {
+                    intrinsics: pinhole([640, 480], [461.2, 461.5], [324.6, 236.9]),
+                    camera_from_depth: Transform::translation(0.001, -0.0141, -0.004),
+                }),
+                noise_sigma_m: 0.0025,
+                min_m: 0.15,
+                max_m: 2.6,
+                metres_per_count: 0.00025,
+                ..DepthConfig::default()
+            }),
+            ..Self::wrist(name)
+        }
+    }
 }
 
-/// The bracket of the wrist camera, as `flange_from_camera`: beside the flange, tilted by 50 degrees to look past it.
+/// The bracket of the wrist camera, as `flange_from_camera`: beside the flange, tilted to look past it.
 ///
 /// The tilt lets the arm look at the scene from low elevations without reaching its joint limits.
-fn wrist_mount() -> Transform {
+fn wrist_mount(tilt_degrees: f64) -> Transform {
     let quarter = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2);
-    let tilt = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), 50f64.to_radians());
+    let tilt = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), tilt_degrees.to_radians());
     Transform::from_parts(Translation3::new(0.06, 0.0, 0.045), quarter * tilt)
 }
 
@@ -187,6 +294,9 @@ impl Default for Config {
             joint_names: (1..=7).map(|ix| format!("panda_joint{ix}")).collect(),
             reading_order: (1..=7).map(|ix| format!("panda_joint{ix}")).collect(),
             cameras: vec![CameraConfig::wrist("wrist")],
+            scanners: Vec::new(),
+            base: BaseConfig::default(),
+            light_inside_frac: 1.0,
         }
     }
 }
@@ -207,10 +317,13 @@ impl Config {
         if let Some(secs) = self.duration_secs {
             check("sim", "duration_secs", secs, 0.0, 1e6)?;
         }
-        if self.joint_names.len() != N_JOINTS {
-            return Err(Error::NJoints { got: self.joint_names.len(), expected: N_JOINTS });
+        let expected = if self.scene.has_arm() { N_JOINTS } else { 0 };
+        if self.joint_names.len() != expected {
+            return Err(Error::NJoints { got: self.joint_names.len(), expected });
         }
         self.joint_ixs()?;
+        check("sim", "light_inside_frac", self.light_inside_frac, 0.0, 4.0)?;
+        self.base.check()?;
         if self.cameras.is_empty() {
             return Err(Error::NoCamera);
         }
@@ -219,8 +332,43 @@ impl Config {
                 return Err(Error::SameName { camera: camera.name.clone() });
             }
             camera.check()?;
+            if camera.parent == Parent::Flange && !self.scene.has_arm() {
+                return Err(Error::NoFlange { camera: camera.name.clone() });
+            }
+        }
+        for (ix, scanner) in self.scanners.iter().enumerate() {
+            if self.scanners[..ix].iter().any(|other| other.name == scanner.name) {
+                return Err(Error::SameName { camera: scanner.name.clone() });
+            }
+            scanner.check()?;
         }
         Ok(())
+    }
+}
+
+impl BaseConfig {
+    fn check(&self) -> Result<(), Error> {
+        check("base", "rate_hz", self.rate_hz, 1.0, 1000.0)?;
+        check("base", "drift_m", self.drift_m, 0.0, 10.0)?;
+        check("base", "drift_rad", self.drift_rad, 0.0, 1.0)
+    }
+}
+
+impl ScannerConfig {
+    fn check(&self) -> Result<(), Error> {
+        let of = &self.name;
+        check(of, "rate_hz", self.rate_hz, 0.1, 50.0)?;
+        check(of, "n_rings", self.n_rings.into(), 1.0, 256.0)?;
+        check(of, "n_columns", self.n_columns.into(), 4.0, 4096.0)?;
+        check(of, "lowest elevation", self.elevation_rad[0], -1.57, 1.57)?;
+        check(of, "highest elevation", self.elevation_rad[1], self.elevation_rad[0], 1.57)?;
+        check(of, "min_m", self.min_m, 0.0, 100.0)?;
+        check(of, "max_m", self.max_m, self.min_m, 1000.0)?;
+        check(of, "noise_sigma_m", self.noise_sigma_m, 0.0, 1.0)?;
+        check(of, "dropped_frac", self.dropped_frac, 0.0, 0.9)?;
+        let pose =
+            self.base_from_scanner.translation.vector.iter().chain(self.base_from_scanner.rotation.coords.iter());
+        pose.into_iter().try_for_each(|number| check(of, "base_from_scanner", *number, -100.0, 100.0))
     }
 }
 
@@ -229,13 +377,7 @@ pub const N_JOINTS: usize = 7;
 
 impl CameraConfig {
     fn check(&self) -> Result<(), Error> {
-        let Intrinsics { size_px, focal_px, principal_px, .. } = &self.intrinsics;
-        for axis in 0..2 {
-            let size = f64::from(size_px[axis]);
-            check(&self.name, "size_px", size, 16.0, 4096.0)?;
-            check(&self.name, "focal_px", focal_px[axis], 0.2 * size, 20.0 * size)?;
-            check(&self.name, "principal_px", principal_px[axis], 0.0, size)?;
-        }
+        check_lens(&self.name, &self.intrinsics)?;
         check(&self.name, "rate_hz", self.rate_hz, 0.01, 200.0)?;
         let pose =
             self.parent_from_camera.translation.vector.iter().chain(self.parent_from_camera.rotation.coords.iter());
@@ -252,6 +394,9 @@ impl CameraConfig {
         check(&self.name, "dropped_frac", sensor.dropped_frac, 0.0, 0.9)?;
         check(&self.name, "supersample", f64::from(sensor.supersample), 1.0, 4.0)?;
         if let Some(depth) = &self.depth {
+            if let Some(sensor) = &depth.sensor {
+                check_lens(&self.name, &sensor.intrinsics)?;
+            }
             check(&self.name, "depth noise_sigma_m", depth.noise_sigma_m, 0.0, 1.0)?;
             check(&self.name, "hole_frac", depth.hole_frac, 0.0, 0.9)?;
             check(&self.name, "depth min_m", depth.min_m, 0.0, 10.0)?;
@@ -260,6 +405,17 @@ impl CameraConfig {
         }
         Ok(())
     }
+}
+
+fn check_lens(of: &str, lens: &Intrinsics) -> Result<(), Error> {
+    let Intrinsics { size_px, focal_px, principal_px, .. } = lens;
+    for axis in 0..2 {
+        let size = f64::from(size_px[axis]);
+        check(of, "size_px", size, 16.0, 4096.0)?;
+        check(of, "focal_px", focal_px[axis], 0.2 * size, 20.0 * size)?;
+        check(of, "principal_px", principal_px[axis], 0.0, size)?;
+    }
+    Ok(())
 }
 
 /// Refuses numbers outside `lower..=upper`, and NaN.

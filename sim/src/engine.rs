@@ -1,15 +1,20 @@
 //! Steps the rig and makes the samples, in the order in which devices would deliver them.
 
-use crate::arm::{Arm, Reading, STEP_NANOS};
-use crate::config::{CameraConfig, Config, Parent, SensorConfig};
+use crate::arm::{Reading, STEP_NANOS};
+use crate::base::Drift;
+use crate::cabinet_tour::light_frac;
+use crate::config::{CameraConfig, Config, Parent, Scene, SensorConfig};
+use crate::lidar::{self, RayCaster};
 use crate::noise;
 use crate::optics::{Optics, Shift};
-use crate::panda::{self, Joints};
+use crate::panda::Joints;
 use crate::random::Random;
 use crate::render::{Pending, Renderer};
+use crate::robot::{Posture, Robot};
 use crate::{Error, render};
-use drivers::{Image, PixelFormat, Sample, TruthImage};
+use drivers::{BasePose, Image, PixelFormat, RangeScan, Sample, TruthImage};
 use kinematics::{JointState, Stamp, Transform};
+use mujoco_rs::prelude::MjModel;
 use std::collections::VecDeque;
 use std::sync::Arc;
 
@@ -21,7 +26,12 @@ pub(crate) struct Engine {
     config: Config,
     /// Which joint each number of a reading is of.
     joint_ixs: Vec<usize>,
-    arm: Arm,
+    robot: Robot,
+    drift: Drift,
+    /// Where there are range scanners.
+    rays: Option<RayCaster>,
+    n_base_poses: u64,
+    n_scans: Vec<u64>,
     cameras: Vec<Camera>,
     renderer: Renderer,
     /// Stamp of simulated time zero.
@@ -41,6 +51,10 @@ pub(crate) struct Engine {
 enum Slot {
     Joints(Reading),
     Image(Exposure),
+    /// A pose of the base, at a time in nanoseconds.
+    Base(i64),
+    /// A turn of a scanner: which, the how many'th, and when it began, nanoseconds.
+    Scan(usize, u64, i64),
 }
 
 struct Camera {
@@ -48,6 +62,8 @@ struct Camera {
     config: CameraConfig,
     sensor: SensorConfig,
     optics: Optics,
+    /// Where depth is seen by a sensor of its own.
+    depth_optics: Option<Optics>,
     ix: u64,
     n_exposed: u64,
     n_skipped: u64,
@@ -64,6 +80,7 @@ struct Exposure {
     /// Camera poses at other instants relative to `world_from_camera`, where the shutter makes a difference.
     shifts: Vec<Shift>,
     picture: Pending,
+    depth_picture: Option<Pending>,
 }
 
 /// First exposure of the first camera, and how much later each further camera starts.
@@ -74,6 +91,8 @@ const STAGGER_NANOS: i64 = 3_700_000;
 const COLOR_NOISE: u64 = 1;
 const DEPTH_NOISE: u64 = 2;
 const DROPS: u64 = 3;
+/// Stream of random numbers of one scan.
+const SCANS: u64 = 4;
 
 #[expect(clippy::cast_possible_truncation, reason = "times of a run in nanoseconds fit an i64")]
 fn nanos_from_secs(secs: f64) -> i64 {
@@ -92,7 +111,10 @@ impl Camera {
         };
         let sensor = if ideal { flawless } else { config.sensor };
         let is_sharp = config.parent == Parent::World || (sensor.readout_micros <= 0.0 && sensor.blur_samples <= 1);
+        let depth_sensor = config.depth.as_ref().and_then(|depth| depth.sensor.as_ref());
+        let depth_optics = depth_sensor.map(|sensor| Optics::with_lens(config, &sensor.intrinsics, 1, true));
         Ok(Self {
+            depth_optics: depth_optics.transpose()?,
             name: config.name.as_str().into(),
             optics: Optics::new(config, is_sharp)?,
             config: config.clone(),
@@ -138,11 +160,18 @@ impl Camera {
         offsets
     }
 
-    fn world_from_camera(&self, position_rad: &Joints) -> Transform {
+    fn world_from_camera(&self, robot: &Posture) -> Transform {
         match self.config.parent {
-            Parent::Flange => panda::base_from_flange(position_rad) * self.config.parent_from_camera,
+            Parent::Flange => robot.world_from_flange() * self.config.parent_from_camera,
+            Parent::Base => robot.world_from_base * self.config.parent_from_camera,
             Parent::World => self.config.parent_from_camera,
         }
+    }
+
+    /// What the depth sensor sees where it is not the colour sensor.
+    fn depth_view(&self, world_from_camera: &Transform) -> Option<render::View> {
+        let sensor = self.config.depth.as_ref()?.sensor.as_ref()?;
+        Some(self.depth_optics.as_ref()?.view(world_from_camera * sensor.camera_from_depth, None, 1.0))
     }
 
     fn random(&self, seed: u64, image_ix: u64, stream: u64) -> Random {
@@ -170,17 +199,29 @@ impl Cameras {
 
     /// Size that holds the pictures of all cameras.
     pub(crate) fn largest_view_px(&self) -> [u32; 2] {
-        let sizes = self.0.iter().map(|camera| camera.optics.view_size_px());
+        let all = self.0.iter().flat_map(|camera| std::iter::once(&camera.optics).chain(&camera.depth_optics));
+        let sizes = all.map(Optics::view_size_px);
         sizes.fold([1, 1], |largest, size| [largest[0].max(size[0]), largest[1].max(size[1])])
     }
 }
 
 impl Engine {
-    pub(crate) fn new(config: Config, arm: Arm, cameras: Cameras, renderer: Renderer) -> Result<Self, Error> {
+    pub(crate) fn new(
+        config: Config,
+        robot: Robot,
+        cameras: Cameras,
+        renderer: Renderer,
+        model: Arc<MjModel>,
+    ) -> Result<Self, Error> {
+        let [drift_m, drift_rad] = if config.ideal { [0.0; 2] } else { [config.base.drift_m, config.base.drift_rad] };
         Ok(Self {
             joint_ixs: config.joint_ixs()?,
+            drift: Drift::new(config.seed, drift_m, drift_rad),
+            rays: (!config.scanners.is_empty()).then(|| RayCaster::new(model)),
+            n_base_poses: 0,
+            n_scans: vec![0; config.scanners.len()],
             config,
-            arm,
+            robot,
             cameras: cameras.0,
             renderer,
             start: Stamp(0),
@@ -222,6 +263,8 @@ impl Engine {
                 Some(Slot::Joints(reading)) => {
                     return Ok(Some((reading.nanos, Sample::Joints(self.joint_state(&reading)))));
                 }
+                Some(Slot::Base(nanos)) => self.tell_base(nanos),
+                Some(Slot::Scan(scanner_ix, scan_ix, nanos)) => self.scan(scanner_ix, scan_ix, nanos)?,
                 Some(Slot::Image(exposure)) => {
                     self.n_pending -= 1;
                     self.develop(exposure)?;
@@ -230,21 +273,65 @@ impl Engine {
         }
     }
 
-    /// Moves the arm by one step and starts drawing the images that arrive by then.
+    /// Moves the robot by one step and starts drawing the images that arrive by then.
     fn step(&mut self) -> Result<(), Error> {
-        let reading = self.arm.step();
-        if self.config.duration_secs.is_some_and(|secs| reading.nanos > nanos_from_secs(secs)) {
+        let (nanos, reading) = self.robot.step();
+        if self.config.duration_secs.is_some_and(|secs| nanos > nanos_from_secs(secs)) {
             self.has_ended = true;
             return Ok(());
         }
-        self.slots.push_back(Slot::Joints(reading));
+        self.slots.extend(reading.map(Slot::Joints));
+        self.queue_base_and_scans(nanos);
         for camera_ix in 0..self.cameras.len() {
             while !self.has_ended
-                && self.cameras[camera_ix].stamp_nanos() + self.cameras[camera_ix].wait_nanos() <= reading.nanos
+                && self.cameras[camera_ix].stamp_nanos() + self.cameras[camera_ix].wait_nanos() <= nanos
             {
                 self.expose(camera_ix)?;
             }
         }
+        Ok(())
+    }
+
+    /// Queues the poses of a moving base, and the turns of its scanners that end by now.
+    fn queue_base_and_scans(&mut self, nanos: i64) {
+        let due = |n_done: u64, rate_hz: f64| nanos_from_secs(n_done as f64 / rate_hz);
+        while self.config.scene.has_moving_base() && due(self.n_base_poses, self.config.base.rate_hz) <= nanos {
+            self.slots.push_back(Slot::Base(due(self.n_base_poses, self.config.base.rate_hz)));
+            self.n_base_poses += 1;
+        }
+        for (scanner_ix, scanner) in self.config.scanners.iter().enumerate() {
+            let n_scans = &mut self.n_scans[scanner_ix];
+            while FIRST_NANOS + due(*n_scans + 1, scanner.rate_hz) <= nanos {
+                self.slots.push_back(Slot::Scan(scanner_ix, *n_scans, FIRST_NANOS + due(*n_scans, scanner.rate_hz)));
+                *n_scans += 1;
+            }
+        }
+    }
+
+    /// Tells a pose of the base as its SLAM system sees it, and the truth.
+    fn tell_base(&mut self, nanos: i64) {
+        let (stamp, secs) = (Stamp(self.start.0 + nanos), nanos as f64 * 1e-9);
+        let truth = self.robot.motion().world_from_base(secs);
+        let told = self.drift.told(&truth, self.robot.motion().walked_share(secs));
+        self.ready.push_back((nanos, Sample::Base(BasePose { stamp, world_from_base: told })));
+        if self.config.truth {
+            self.ready.push_back((nanos, Sample::BaseTruth(BasePose { stamp, world_from_base: truth })));
+        }
+    }
+
+    fn scan(&mut self, scanner_ix: usize, scan_ix: u64, nanos: i64) -> Result<(), Error> {
+        let scanner = &self.config.scanners[scanner_ix];
+        let arrival_nanos = nanos + nanos_from_secs(1.0 / scanner.rate_hz);
+        let Some(rays) = self.rays.as_mut().filter(|_| arrival_nanos >= self.skip_before_nanos) else {
+            return Ok(());
+        };
+        let motion = self.robot.motion();
+        let random = Random::new(self.config.seed, &[scanner_ix as u64, scan_ix, SCANS]);
+        let world_from_base = |offset_nanos: i64| motion.world_from_base((nanos + offset_nanos) as f64 * 1e-9);
+        let points = lidar::turn(rays, scanner, self.config.ideal, random, world_from_base)?;
+        let stamp = Stamp(self.start.0 + nanos);
+        let scan = RangeScan { scanner: scanner.name.as_str().into(), stamp, points: points.into() };
+        self.ready.push_back((arrival_nanos, Sample::Range(scan)));
         Ok(())
     }
 
@@ -259,20 +346,28 @@ impl Engine {
             camera.n_skipped += 1;
             return Ok(());
         }
-        let position_at = |nanos: i64| self.arm.position_at(nanos).ok_or(Error::NoHistory { nanos });
-        let position_rad = position_at(stamp_nanos)?;
-        let world_from_camera = camera.world_from_camera(&position_rad);
+        let robot_at = |nanos: i64| self.robot.at(nanos).ok_or(Error::NoHistory { nanos });
+        let robot = robot_at(stamp_nanos)?;
+        let world_from_camera = camera.world_from_camera(&robot);
         let camera_from_world = world_from_camera.inverse();
         let mut shifts = Vec::new();
         for offset in camera.row_offsets_nanos() {
-            let world_from_row = camera.world_from_camera(&position_at(stamp_nanos + offset)?);
+            let world_from_row = camera.world_from_camera(&robot_at(stamp_nanos + offset)?);
             shifts.push(Shift::new(&(camera_from_world * world_from_row)));
         }
-        // A wrist camera sees nothing of its arm; leaving it out keeps its shadow off the scene as well.
-        let arm_rad = (camera.config.parent == Parent::World).then_some(position_rad);
-        let view: render::View = camera.optics.view(world_from_camera, arm_rad);
+        // A camera on the robot sees nothing of it; leaving it out keeps its shadow off the scene as well.
+        let robot = (camera.config.parent == Parent::World).then_some(robot);
+        let light_frac = match self.config.scene {
+            Scene::MobileArm if !self.config.ideal && camera.config.parent == Parent::Flange => {
+                light_frac(&world_from_camera, self.config.light_inside_frac)
+            }
+            _ => 1.0,
+        };
+        let view: render::View = camera.optics.view(world_from_camera, robot, light_frac);
+        let depth_view = camera.depth_view(&world_from_camera);
         let n_skipped = std::mem::take(&mut camera.n_skipped);
         let picture = self.renderer.submit(view)?;
+        let depth_picture = depth_view.map(|view| self.renderer.submit(view)).transpose()?;
         self.slots.push_back(Slot::Image(Exposure {
             camera_ix,
             image_ix,
@@ -282,6 +377,7 @@ impl Engine {
             world_from_camera,
             shifts,
             picture,
+            depth_picture,
         }));
         self.n_pending += 1;
         if camera_ix == 0 {
@@ -297,10 +393,13 @@ impl Engine {
         let picture = exposure.picture.wait()?;
         let (seed, image_ix) = (self.config.seed, exposure.image_ix);
         let stamp = Stamp(self.start.0 + exposure.stamp_nanos);
+        let depth_lens = camera.config.depth.as_ref().and_then(|depth| Some(&depth.sensor.as_ref()?.intrinsics));
+        let color_px = camera.config.intrinsics.size_px;
+        let depth_px = depth_lens.map_or(color_px, |lens| lens.size_px);
         let image = |format: PixelFormat, data: Vec<u8>| Image {
             camera: Arc::clone(&camera.name),
             stamp,
-            size_px: camera.config.intrinsics.size_px,
+            size_px: if matches!(format, PixelFormat::DepthU16 { .. }) { depth_px } else { color_px },
             format,
             data: data.into(),
             exposure_secs: Some(1e-6 * camera.sensor.exposure_micros),
@@ -318,12 +417,18 @@ impl Engine {
         };
         let psnr_ceiling = (is_noisy && self.config.truth).then(|| noise::psnr(&data, seen));
         self.ready.push_back((exposure.arrival_nanos, Sample::Image(image(PixelFormat::Rgb8, data))));
-        let wants_depth = camera.config.depth.is_some() || (self.config.truth && self.config.truth_depth);
+        let own_depth_m = match (&camera.depth_optics, exposure.depth_picture) {
+            (Some(optics), Some(picture)) => Some(optics.depth_m(&picture.wait()?)),
+            _ => None,
+        };
+        let wants_depth =
+            (camera.config.depth.is_some() && own_depth_m.is_none()) || (self.config.truth && self.config.truth_depth);
         let depth_m = if wants_depth { camera.optics.depth_m(&picture) } else { Vec::new() };
         if let Some(depth) = &camera.config.depth {
-            let width = camera.config.intrinsics.size_px[0] as usize;
+            let width = depth_px[0] as usize;
             let random = camera.random(seed, image_ix, DEPTH_NOISE);
-            let counts = noise::depth_counts(&depth_m, width, depth, random, self.config.ideal);
+            let seen_m = own_depth_m.as_ref().unwrap_or(&depth_m);
+            let counts = noise::depth_counts(seen_m, width, depth, random, self.config.ideal);
             let data = counts.iter().flat_map(|count| count.to_le_bytes()).collect();
             let format = PixelFormat::DepthU16 { metres_per_count: depth.metres_per_count };
             self.ready.push_back((exposure.arrival_nanos, Sample::Image(image(format, data))));

@@ -37,6 +37,12 @@ pub enum Error {
     /// Nothing to render.
     #[error("a simulated rig needs at least one camera")]
     NoCamera,
+    /// There is no flange to fix a camera to.
+    #[error("camera {camera:?} has the parent flange, but the robot of this scene has no arm")]
+    NoFlange {
+        /// Name of the camera.
+        camera: String,
+    },
     /// Two cameras cannot be told apart.
     #[error("two cameras are named {camera:?}")]
     SameName {
@@ -46,6 +52,12 @@ pub enum Error {
     /// MuJoCo does not accept the scene that was built.
     #[error("mujoco refuses the scene: {reason}")]
     Scene {
+        /// What MuJoCo says.
+        reason: String,
+    },
+    /// MuJoCo casts no rays.
+    #[error("mujoco casts no rays: {reason}")]
+    Rays {
         /// What MuJoCo says.
         reason: String,
     },

@@ -4,10 +4,17 @@
 //! seed; [`Rig::into_live`] plays it in real time as devices.
 
 mod arm;
+mod base;
+mod cabinet;
+mod cabinet_tour;
 pub mod config;
 mod egl;
 mod engine;
 mod error;
+mod furniture;
+mod lab;
+mod lab_texture;
+mod lidar;
 mod light;
 mod live;
 mod lockstep;
@@ -19,18 +26,22 @@ mod panda;
 mod random;
 mod render;
 mod rig;
+mod robot;
 mod scan;
 mod scene;
 pub mod tag;
 mod texture;
 mod toy;
 
-/// Where the objects of the static-arm scene are, for whoever checks pictures of it.
+/// Where things are in the scenes, for whoever checks pictures and scans of them.
 pub mod layout {
+    pub use crate::lab::{PEDESTAL_HALF_M, ROOM_HALF_M, ROOM_HEIGHT_M};
     pub use crate::objects::{BLOCK_HALF_M, CUBE_HALF_M, TABLE_Z_M, TARGET_XY_M, world_from_block, world_from_cube};
 }
 
-pub use config::{CameraConfig, Config, DepthConfig, Parent, Scene, SensorConfig};
+pub use config::{
+    BaseConfig, CameraConfig, Config, DepthConfig, DepthSensor, Parent, ScannerConfig, Scene, SensorConfig,
+};
 pub use error::Error;
 pub use live::{LiveRig, LiveTruth};
 pub use lockstep::Lockstep;

@@ -31,8 +31,6 @@ const KEY_SIZE: f64 = 0.06;
 /// Rays to the key lamp, and rays to everywhere.
 const N_KEY_RAYS: u64 = 12;
 const N_AMBIENT_RAYS: u64 = 20;
-/// What is further away takes no ambient light, metres.
-const AMBIENT_REACH_M: f64 = 0.25;
 
 impl Lamp {
     fn towards(&self) -> Vector3<f64> {
@@ -44,15 +42,15 @@ impl Lamp {
     }
 }
 
-/// The lamps and the ambient light as MJCF: elements of the world body, and of the visual settings.
-pub(crate) fn mjcf() -> (String, String) {
-    let list = |numbers: [f64; 3]| numbers.map(|number| number.to_string()).join(" ");
+/// The lamps and the ambient light as MJCF, brighter by a factor: elements of the world body, and of the visual settings.
+pub(crate) fn mjcf(gain: f64) -> (String, String) {
+    let list = |numbers: [f64; 3]| numbers.map(|number| (gain * number).to_string()).join(" ");
     let mut lamps = String::new();
     for lamp in [&KEY].into_iter().chain(&FILLS) {
         let _ = writeln!(
             lamps,
             "<light directional=\"true\" pos=\"0.7 0 2\" dir=\"{}\" diffuse=\"{}\" specular=\"{}\" castshadow=\"false\"/>",
-            list(lamp.direction),
+            lamp.direction.map(|number| number.to_string()).join(" "),
             list(lamp.diffuse),
             list([lamp.specular; 3])
         );
@@ -68,6 +66,8 @@ pub(crate) struct Blockers {
     ellipsoids: Vec<Ellipsoid>,
     /// Sphere around all ellipsoids.
     bounds: (Point3<f64>, f64),
+    /// What is further away takes no ambient light, metres.
+    ambient_reach_m: f64,
 }
 
 struct Ellipsoid {
@@ -77,8 +77,9 @@ struct Ellipsoid {
 }
 
 impl Blockers {
-    pub(crate) fn new() -> Self {
-        Self { boxes: Vec::new(), ellipsoids: Vec::new(), bounds: (Point3::origin(), 0.0) }
+    /// Nothing yet. What is further away than `ambient_reach_m` takes no ambient light.
+    pub(crate) fn new(ambient_reach_m: f64) -> Self {
+        Self { boxes: Vec::new(), ellipsoids: Vec::new(), bounds: (Point3::origin(), 0.0), ambient_reach_m }
     }
 
     pub(crate) fn add_box(&mut self, world_from_box: Transform, half_m: [f64; 3]) {
@@ -150,7 +151,7 @@ impl Blockers {
             let square = (*ray as f64 + random.unit(2 + ray)) / N_AMBIENT_RAYS as f64;
             let (sin, cos) = (*ray as f64 * 2.399_963 + random.between(1, 0.0, std::f64::consts::TAU)).sin_cos();
             let direction = normal * (1.0 - square).sqrt() + (side * cos + across * sin) * square.sqrt();
-            !self.blocks(from, &direction, AMBIENT_REACH_M)
+            !self.blocks(from, &direction, self.ambient_reach_m)
         });
         n_free.count() as f64 / N_AMBIENT_RAYS as f64
     }
@@ -186,7 +187,7 @@ mod tests {
 
     #[test]
     fn a_box_darkens_the_side_away_from_the_lamp_and_the_corner_below_it() {
-        let mut blockers = Blockers::new();
+        let mut blockers = Blockers::new(0.25);
         blockers.add_box(Transform::translation(0.0, 0.0, 0.05), [0.05; 3]);
         let up = Vector3::z();
         let share = |x: f64, y: f64| blockers.light_share(&Point3::new(x, y, 0.0), &up, 1);
@@ -198,7 +199,7 @@ mod tests {
 
     #[test]
     fn rays_meet_ellipsoids_where_they_are() {
-        let mut blockers = Blockers::new();
+        let mut blockers = Blockers::new(0.25);
         let axes = [Vector3::x() * 0.2, Vector3::y() * 0.1, Vector3::z() * 0.1];
         blockers.add_ellipsoids([(Point3::new(1.0, 0.0, 0.0), axes)].into_iter(), (Point3::new(1.0, 0.0, 0.0), 0.2));
         let hits = |y: f64, reach: f64| blockers.blocks(&Point3::new(0.0, y, 0.0), &Vector3::x(), reach);

@@ -3,7 +3,7 @@
 use crate::Error;
 use crate::engine::{Delivery, Engine};
 use crate::rig::RigInfo;
-use drivers::{Arm, Camera, Image, PixelFormat, Sample, TruthImage};
+use drivers::{Arm, Base, BasePose, Camera, Devices, Image, PixelFormat, RangeScan, RangeScanner, Sample};
 use kinematics::{Intrinsics, JointState, Stamp};
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -14,18 +14,18 @@ use std::time::{Duration, Instant};
 const MAX_IMAGES: usize = 8;
 /// Joint readings that wait: one second.
 const MAX_READINGS: usize = 1000;
-/// Truth images that wait.
-const MAX_TRUTH: usize = 8;
+/// Range scans that wait.
+const MAX_SCANS: usize = 20;
+/// True images and base poses that wait.
+const MAX_TRUTH: usize = 200;
 /// A player that is later than this skips images.
 const MAX_LATE: Duration = Duration::from_millis(50);
 
 /// Simulated devices that deliver in real time.
 pub struct LiveRig {
-    /// One a camera, in the order of the configuration.
-    pub cameras: Vec<Box<dyn Camera>>,
-    /// The arm's joint readings.
-    pub arm: Box<dyn Arm>,
-    /// Ground truth of the colour images; the oldest goes when nobody takes it.
+    /// Cameras in the order of the configuration, the arm, the base where it moves, scanners.
+    pub devices: Devices,
+    /// Ground truth of colour images and base poses; the oldest goes when nobody takes it.
     pub truth: LiveTruth,
     /// What the rig is made of.
     pub info: RigInfo,
@@ -38,7 +38,7 @@ pub struct LiveTruth {
 
 impl LiveTruth {
     /// The oldest truth that was not taken yet, without waiting.
-    pub fn take(&self) -> Option<TruthImage> {
+    pub fn take(&self) -> Option<Sample> {
         self.player.shared.lock().truth.pop_front()
     }
 }
@@ -72,7 +72,10 @@ struct State {
     /// Images of a camera lost and not yet told: colour and depth.
     lost: Vec<[u64; 2]>,
     readings: VecDeque<JointState>,
-    truth: VecDeque<TruthImage>,
+    poses: VecDeque<BasePose>,
+    /// One a scanner.
+    scans: Vec<VecDeque<RangeScan>>,
+    truth: VecDeque<Sample>,
     /// Why there will be no more samples.
     end: Option<String>,
     stop: bool,
@@ -86,27 +89,45 @@ impl LiveRig {
             let mut state = shared.lock();
             state.images = vec![VecDeque::new(); names.len()];
             state.lost = vec![[0; 2]; names.len()];
+            state.scans = vec![VecDeque::new(); info.scanner_names.len()];
         }
         let thread = std::thread::Builder::new().name("sim-live".to_owned()).spawn({
             let shared = Arc::clone(&shared);
-            move || play(engine, &shared, &names, start)
+            let scanner_names = info.scanner_names.clone();
+            move || play(engine, &shared, &Names { cameras: names, scanners: scanner_names }, start)
         });
         let player = Arc::new(Player { shared, thread: Some(thread.map_err(Error::Thread)?) });
         let cameras = info.cameras.iter().enumerate().map(|(camera_ix, camera)| {
             let (name, intrinsics) = (camera.name.clone(), camera.intrinsics.clone());
             Box::new(LiveCamera { player: Arc::clone(&player), camera_ix, name, intrinsics }) as Box<dyn Camera>
         });
+        let arm = LiveArm { player: Arc::clone(&player), joint_names: info.joint_names.clone() };
+        let base = LiveBase { player: Arc::clone(&player) };
+        let scanners = info.scanner_names.iter().enumerate().map(|(scanner_ix, name)| {
+            let (player, name) = (Arc::clone(&player), name.clone());
+            Box::new(LiveScanner { player, scanner_ix, name }) as Box<dyn RangeScanner>
+        });
         Ok(Self {
-            cameras: cameras.collect(),
-            arm: Box::new(LiveArm { player: Arc::clone(&player), joint_names: info.joint_names.clone() }),
+            devices: Devices {
+                cameras: cameras.collect(),
+                arm: (!info.joint_names.is_empty()).then(|| Box::new(arm) as Box<dyn Arm>),
+                base: info.has_moving_base.then(|| Box::new(base) as Box<dyn Base>),
+                scanners: scanners.collect(),
+            },
             truth: LiveTruth { player },
             info,
         })
     }
 }
 
+/// Names of the devices, in the order of their queues.
+struct Names {
+    cameras: Vec<Arc<str>>,
+    scanners: Vec<String>,
+}
+
 /// Delivers samples when their time comes, until the rig ends or nobody is left.
-fn play(mut engine: Engine, shared: &Shared, names: &[Arc<str>], start: Stamp) {
+fn play(mut engine: Engine, shared: &Shared, names: &Names, start: Stamp) {
     engine.set_start(start);
     let began = Instant::now();
     let end = loop {
@@ -143,17 +164,22 @@ impl Shared {
     }
 
     /// Queues a sample; false when nobody wants it any more.
-    fn deliver(&self, (_, sample): Delivery, names: &[Arc<str>]) -> bool {
+    fn deliver(&self, (_, sample): Delivery, names: &Names) -> bool {
         let mut state = self.lock();
         match sample {
             Sample::Image(image) => {
-                if let Some(camera_ix) = names.iter().position(|name| *name == image.camera) {
+                if let Some(camera_ix) = names.cameras.iter().position(|name| *name == image.camera) {
                     state.put_image(camera_ix, image);
                 }
             }
             Sample::Joints(reading) => put(&mut state.readings, MAX_READINGS, reading),
-            Sample::Truth(truth) => put(&mut state.truth, MAX_TRUTH * names.len(), truth),
-            Sample::Base(_) => {}
+            Sample::Base(pose) => put(&mut state.poses, MAX_READINGS, pose),
+            Sample::Range(scan) => {
+                if let Some(scanner_ix) = names.scanners.iter().position(|name| **name == *scan.scanner) {
+                    put(&mut state.scans[scanner_ix], MAX_SCANS, scan);
+                }
+            }
+            truth @ (Sample::Truth(_) | Sample::BaseTruth(_)) => put(&mut state.truth, MAX_TRUTH, truth),
         }
         let goes_on = !state.stop;
         drop(state);
@@ -247,5 +273,33 @@ impl Arm for LiveArm {
     fn read(&mut self, timeout: Duration) -> Result<JointState, drivers::Error> {
         let silence = || drivers::Error::NoJoints { waited: timeout };
         self.player.shared.wait(timeout, |state| state.readings.pop_front(), silence)
+    }
+}
+
+struct LiveBase {
+    player: Arc<Player>,
+}
+
+impl Base for LiveBase {
+    fn next_pose(&mut self, timeout: Duration) -> Result<BasePose, drivers::Error> {
+        let silence = || drivers::Error::NoBasePose { waited: timeout };
+        self.player.shared.wait(timeout, |state| state.poses.pop_front(), silence)
+    }
+}
+
+struct LiveScanner {
+    player: Arc<Player>,
+    scanner_ix: usize,
+    name: String,
+}
+
+impl RangeScanner for LiveScanner {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn next_scan(&mut self, timeout: Duration) -> Result<RangeScan, drivers::Error> {
+        let silence = || drivers::Error::NoScan { scanner: self.name.clone(), waited: timeout };
+        self.player.shared.wait(timeout, |state| state.scans[self.scanner_ix].pop_front(), silence)
     }
 }

@@ -1,5 +1,6 @@
 //! Triangle meshes with normals and texture coordinates, in MuJoCo's binary format.
 
+use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
 
 /// Triangles whose corners carry a normal and a texture coordinate.
@@ -132,6 +133,57 @@ impl Mesh {
         self.normals.extend(other.normals);
         self.texcoords.extend(other.texcoords);
         self.faces.extend(other.faces.iter().map(|face| face.map(|corner| corner + first)));
+    }
+
+    /// Adds another mesh, moved and turned.
+    pub(crate) fn append_at(&mut self, mut other: Self, self_from_other: &Transform) {
+        for (point, normal) in other.points_m.iter_mut().zip(&mut other.normals) {
+            *point = (self_from_other.cast::<f32>() * Point3::from(*point)).coords.into();
+            *normal = (self_from_other.cast::<f32>() * Vector3::from(*normal)).into();
+        }
+        self.append(other, Vector3::zeros());
+    }
+
+    /// A surface turned about z: from `(radius, z)` to `(radius, z)`, metres, seen from the left of that way, upwards from outside.
+    ///
+    /// The texture runs once around, its top at the first point; between points that lie on a bend the normals are smooth.
+    pub(crate) fn lathe(profile_m: &[[f64; 2]], n_sectors: u32, texture: TextureRect, is_smooth: bool) -> Self {
+        let mut mesh = Self::default();
+        let [left, top, right, bottom] = texture;
+        let n_pieces = profile_m.len() - 1;
+        let slope = |piece: usize| {
+            let [a, b] = [profile_m[piece], profile_m[piece + 1]];
+            // Outward for a way that goes up outside.
+            Vector3::new(b[1] - a[1], 0.0, a[0] - b[0]).normalize()
+        };
+        let bend = |piece: usize, end: usize| {
+            let other = (piece + end).checked_sub(1).filter(|other| *other < n_pieces && is_smooth);
+            let neighbor = if end == 0 { other } else { Some(piece + 1).filter(|next| *next < n_pieces && is_smooth) };
+            (slope(piece) + neighbor.map_or_else(Vector3::zeros, slope)).normalize()
+        };
+        for piece in 0..n_pieces {
+            let mut before: Option<[i32; 2]> = None;
+            for sector in 0..=n_sectors {
+                let share = f64::from(sector) / f64::from(n_sectors);
+                let (sin, cos) = (share * std::f64::consts::TAU).sin_cos();
+                let turned = |v: Vector3<f64>| Vector3::new(v.x * cos, v.x * sin, v.z);
+                let ring = [0, 1].map(|end| {
+                    let [radius, z] = profile_m[piece + end];
+                    let down = (piece + end) as f64 / n_pieces as f64;
+                    mesh.push(Corner {
+                        point_m: Point3::new(radius * cos, radius * sin, z),
+                        normal: turned(bend(piece, end)),
+                        texcoord: [left + (right - left) * share, top + (bottom - top) * down],
+                    })
+                });
+                if let Some([low, high]) = before {
+                    mesh.triangle([low, ring[0], ring[1]]);
+                    mesh.triangle([low, ring[1], high]);
+                }
+                before = Some(ring);
+            }
+        }
+        mesh
     }
 
     /// The bytes of MuJoCo's `.msh` format: four counts, then points, normals, texture coordinates and faces.

@@ -88,7 +88,7 @@ pub(crate) fn objects() -> Vec<Object> {
 }
 
 /// The textures by name, light included.
-pub(crate) fn textures() -> [(&'static str, Texture); 7] {
+pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
     let blockers = blockers();
     let [mut brick, mut plaster] = [texture::brick_wall(), texture::plaster_wall()];
     for (wall, side) in [(&mut brick, 1.0), (&mut plaster, -1.0)] {
@@ -106,7 +106,7 @@ pub(crate) fn textures() -> [(&'static str, Texture); 7] {
     let [mut wood, mut tags] = [texture::wood(), texture::tags()];
     shade_box(&mut wood, &blockers, BLOCK_HALF_M, &world_from_block());
     shade_box(&mut tags, &blockers, [CUBE_HALF_M; 3], &world_from_cube());
-    [
+    vec![
         ("brick", brick),
         ("plaster", plaster),
         ("metal", metal),
@@ -117,7 +117,7 @@ pub(crate) fn textures() -> [(&'static str, Texture); 7] {
     ]
 }
 
-fn shade_box(texture: &mut Texture, blockers: &Blockers, half_m: [f64; 3], world_from_box: &Transform) {
+pub(crate) fn shade_box(texture: &mut Texture, blockers: &Blockers, half_m: [f64; 3], world_from_box: &Transform) {
     for side in 0..6 {
         texture.shade(texture::side_rectangle(side), 40, |u, v, name| {
             let (point, normal) = Mesh::on_cuboid(half_m, side, u, v);
@@ -128,7 +128,9 @@ fn shade_box(texture: &mut Texture, blockers: &Blockers, half_m: [f64; 3], world
 
 fn blockers() -> Blockers {
     const WALL_HALF_THICKNESS_M: f64 = 0.005;
-    let mut blockers = Blockers::new();
+    /// Of the size of the objects.
+    const AMBIENT_REACH_M: f64 = 0.25;
+    let mut blockers = Blockers::new(AMBIENT_REACH_M);
     blockers.add_box(world_from_cube(), [CUBE_HALF_M; 3]);
     blockers.add_box(world_from_block(), BLOCK_HALF_M);
     let table = table_center() - Vector3::new(0.0, 0.0, TABLE_HALF_THICKNESS_M);

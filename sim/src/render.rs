@@ -4,11 +4,12 @@
 
 use crate::Error;
 use crate::egl::HeadlessContext;
-use crate::panda::Joints;
-use crate::scene::{ARM_GROUP, NEAR_FAR_M};
+use crate::robot::Posture;
+use crate::scene::ARM_GROUP;
 use crossbeam_channel::{Receiver, Sender, bounded};
 use kinematics::Transform;
 use mujoco_rs::prelude::{MjData, MjModel, MjrContext, MjrRectangle, MjvCamera, MjvOption, MjvPerturb, MjvScene};
+use mujoco_rs::wrappers::traits::ModelType;
 use nalgebra::Vector3;
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -20,8 +21,10 @@ pub(crate) struct View {
     pub(crate) focal_px: [f64; 2],
     pub(crate) principal_px: [f64; 2],
     pub(crate) world_from_camera: Transform,
-    /// Where the arm is; not drawn, and without a shadow, when `None`.
-    pub(crate) arm_rad: Option<Joints>,
+    /// Where the robot is; not drawn, and without a shadow, when `None`.
+    pub(crate) robot: Option<Posture>,
+    /// Brightness of all lamps; 1 is as built.
+    pub(crate) light_frac: f64,
 }
 
 /// A drawn picture, from the top left.
@@ -62,7 +65,7 @@ fn stopped() -> Error {
 
 impl Renderer {
     /// Starts the thread and its context.
-    pub(crate) fn start(model: Arc<MjModel>) -> Result<Self, Error> {
+    pub(crate) fn start(model: Arc<MjModel>, near_far_m: [f64; 2]) -> Result<Self, Error> {
         let (jobs, queue) = bounded::<Job>(4);
         let (ready, started) = bounded(1);
         let thread = std::thread::Builder::new()
@@ -71,7 +74,7 @@ impl Renderer {
                 Ok(context) => {
                     // A closed channel means that the rig is gone already.
                     let _ = ready.send(Ok(context.renderer().to_owned()));
-                    draw_all(&context, &model, &queue);
+                    draw_all(&context, &model, near_far_m, &queue);
                 }
                 Err(error) => {
                     let _ = ready.send(Err(error));
@@ -107,7 +110,7 @@ impl Drop for Renderer {
 }
 
 /// Draws until the last sender is gone. The context outlives everything that MuJoCo made in it.
-fn draw_all(_current: &HeadlessContext, model: &Arc<MjModel>, queue: &Receiver<Job>) {
+fn draw_all(_current: &HeadlessContext, model: &Arc<MjModel>, near_far_m: [f64; 2], queue: &Receiver<Job>) {
     // SAFETY: an OpenGL context is current on this thread until after `Canvas` is dropped; only this model is drawn.
     let mut context = unsafe { MjrContext::new(model) };
     context.offscreen();
@@ -115,6 +118,7 @@ fn draw_all(_current: &HeadlessContext, model: &Arc<MjModel>, queue: &Receiver<J
         scene: MjvScene::new(model, usize::try_from(model.ffi().ngeom).unwrap_or(0) + 16),
         data: MjData::new(Arc::clone(model)),
         context,
+        near_far_m,
     };
     for job in queue {
         // The asker may have given up; the next one may not.
@@ -126,18 +130,23 @@ struct Canvas {
     scene: MjvScene,
     data: MjData<Arc<MjModel>>,
     context: MjrContext,
+    near_far_m: [f64; 2],
 }
 
 impl Canvas {
     fn draw(&mut self, view: &View) -> Picture {
         let mut options = MjvOption::default();
-        options.geomgroup[ARM_GROUP] = view.arm_rad.is_some().into();
-        if let Some(position) = &view.arm_rad {
-            self.data.qpos_mut().copy_from_slice(position.as_slice());
+        options.geomgroup[ARM_GROUP] = view.robot.is_some().into();
+        if let Some(robot) = &view.robot {
+            if let Some(joints_rad) = &robot.joints_rad {
+                self.data.qpos_mut().copy_from_slice(joints_rad.as_slice());
+            }
+            place_base(&mut self.data, &robot.world_from_base);
         }
         self.data.forward_kinematics();
         self.scene.update(&mut self.data, &options, &MjvPerturb::default(), &mut MjvCamera::default());
         self.aim(view);
+        self.dim(view.light_frac as f32);
         let [width, height] = view.size_px;
         let viewport = MjrRectangle::new(0, 0, i32::try_from(width).unwrap_or(0), i32::try_from(height).unwrap_or(0));
         self.scene.render(&viewport, &self.context);
@@ -146,7 +155,7 @@ impl Canvas {
 
     /// Points both of the scene's cameras; MuJoCo draws from their mean.
     fn aim(&mut self, view: &View) {
-        let [near, far] = NEAR_FAR_M;
+        let [near, far] = self.near_far_m;
         let pose = &view.world_from_camera;
         let in_f32 = |vector: Vector3<f64>| [vector.x as f32, vector.y as f32, vector.z as f32];
         let [width, height] = view.size_px.map(f64::from);
@@ -168,6 +177,18 @@ impl Canvas {
         }
     }
 
+    /// Makes all lamps brighter or darker.
+    fn dim(&mut self, light_frac: f32) {
+        // SAFETY: only colours of lamps are written, which hold plain numbers.
+        let scene = unsafe { self.scene.ffi_mut() };
+        let n_lamps = usize::try_from(scene.nlight).unwrap_or(0);
+        for lamp in scene.lights.iter_mut().take(n_lamps) {
+            for channel in lamp.ambient.iter_mut().chain(&mut lamp.diffuse).chain(&mut lamp.specular) {
+                *channel *= light_frac;
+            }
+        }
+    }
+
     fn read(&self, size_px: [u32; 2], viewport: &MjrRectangle) -> Picture {
         let [width, height] = size_px.map(|side| side as usize);
         let mut from_bottom = vec![0; 3 * width * height];
@@ -180,7 +201,9 @@ impl Canvas {
         for row in (0..height).rev() {
             rgb.extend_from_slice(&from_bottom[3 * width * row..3 * width * (row + 1)]);
             depth_m.extend(
-                depth_from_bottom[width * row..width * (row + 1)].iter().map(|depth| metres_from_depth(*depth)),
+                depth_from_bottom[width * row..width * (row + 1)]
+                    .iter()
+                    .map(|depth| metres_from_depth(*depth, self.near_far_m)),
             );
         }
         Picture { size_px, rgb, depth_m }
@@ -188,7 +211,18 @@ impl Canvas {
 }
 
 /// Inverts the perspective projection's depth, 0 at the near plane and 1 at the far plane.
-fn metres_from_depth(depth: f32) -> f32 {
-    let [near, far] = NEAR_FAR_M.map(|metres| metres as f32);
+fn metres_from_depth(depth: f32, near_far_m: [f64; 2]) -> f32 {
+    let [near, far] = near_far_m.map(|metres| metres as f32);
     near * far / (far - depth * (far - near))
+}
+
+/// Puts the base of a scene where it moves; nothing where it does not.
+pub(crate) fn place_base<M: ModelType>(data: &mut MjData<M>, world_from_base: &Transform) {
+    if let Some(place) = data.mocap_pos_mut().first_mut() {
+        *place = world_from_base.translation.vector.into();
+    }
+    if let Some(turn) = data.mocap_quat_mut().first_mut() {
+        let q = world_from_base.rotation.coords;
+        *turn = [q.w, q.x, q.y, q.z];
+    }
 }

@@ -1,18 +1,35 @@
 //! Builds a rig and tells what it is made of.
 
 use crate::arm::Arm;
-use crate::config::{Config, Parent};
+use crate::base::{BaseMotion, base_from_arm};
+use crate::cabinet_tour::CabinetTour;
+use crate::config::{Config, Parent, Scene};
 use crate::engine::{Cameras, Engine, history_nanos};
 use crate::live::LiveRig;
 use crate::lockstep::Lockstep;
 use crate::render::Renderer;
-use crate::scan::{Follower, Scan};
+use crate::robot::Robot;
+use crate::scan::{Follower, Scan, Tour};
 use crate::{CameraConfig, Error, scene};
 use kinematics::{Intrinsics, Stamp, Transform};
 use std::sync::Arc;
 
 /// The simulated arm as a URDF: same kinematics and limits, base `panda_link0`, flange `panda_link8`.
 pub const PANDA_URDF: &str = include_str!("../../rigs/robots/panda.urdf");
+
+/// The mobile arm as a URDF: root `base`, arm as above.
+const MOBILE_ARM_URDF: &str = include_str!("../../rigs/robots/mobile-arm.urdf");
+/// The quadruped as a URDF: root `base`, `mount` on its back.
+const QUADRUPED_URDF: &str = include_str!("../../rigs/robots/quadruped.urdf");
+
+/// The robot of a scene.
+pub(crate) fn urdf_of(scene: Scene) -> &'static str {
+    match scene {
+        Scene::StaticArm => PANDA_URDF,
+        Scene::MobileBase => QUADRUPED_URDF,
+        Scene::MobileArm => MOBILE_ARM_URDF,
+    }
+}
 
 /// A rig that is ready to play.
 pub struct Rig {
@@ -27,9 +44,13 @@ pub struct RigInfo {
     pub cameras: Vec<CameraInfo>,
     /// Names of the joints in the order of the readings.
     pub joint_names: Vec<String>,
-    /// The arm; base `panda_link0`, flange `panda_link8`. Its joints keep their own names.
+    /// The scanners in the order of the configuration.
+    pub scanner_names: Vec<String>,
+    /// Whether the base tells where it is.
+    pub has_moving_base: bool,
+    /// The robot; its joints keep their own names.
     pub urdf: &'static str,
-    /// Pose of the arm's base.
+    /// Pose of the robot's base at the start.
     pub world_from_base: Transform,
     /// What draws, as OpenGL names it.
     pub renderer: String,
@@ -59,15 +80,30 @@ pub fn open(config: &Config) -> Result<Rig, Error> {
     config.check()?;
     let cameras = Cameras::new(config)?;
     let model = Arc::new(scene::build(config, cameras.largest_view_px())?);
-    let renderer = Renderer::start(Arc::clone(&model))?;
-    let follower = Follower::new(Scan::new(config.speed, config.azimuth_only), scanning_camera(config))?;
-    let arm = Arm::new(model, follower, history_nanos(config))?;
-    let engine = Engine::new(config.clone(), arm, cameras, renderer)?;
+    let renderer = Renderer::start(Arc::clone(&model), scene::near_far_m(config.scene))?;
+    let motion = BaseMotion::of(config.scene, config.speed);
+    let tour = match config.scene {
+        Scene::StaticArm => Some(Tour::Table(Scan::new(config.speed, config.azimuth_only))),
+        Scene::MobileBase => None,
+        Scene::MobileArm => Some(Tour::Cabinet(CabinetTour::new(motion, config.speed))),
+    };
+    let arm = match tour {
+        Some(tour) => {
+            let follower = Follower::new(tour, scanning_camera(config))?;
+            Some(Arm::new(Arc::clone(&model), follower, history_nanos(config))?)
+        }
+        None => None,
+    };
+    let base_from_arm = if config.scene.has_moving_base() { base_from_arm() } else { Transform::identity() };
+    let robot = Robot::new(arm, motion, base_from_arm);
+    let engine = Engine::new(config.clone(), robot, cameras, renderer, model)?;
     let info = RigInfo {
         cameras: config.cameras.iter().map(|camera| camera_info(camera, config.ideal)).collect(),
         joint_names: config.reading_order.clone(),
-        urdf: PANDA_URDF,
-        world_from_base: Transform::identity(),
+        scanner_names: config.scanners.iter().map(|scanner| scanner.name.clone()).collect(),
+        has_moving_base: config.scene.has_moving_base(),
+        urdf: urdf_of(config.scene),
+        world_from_base: motion.world_from_base(0.0),
         renderer: engine.renderer_name().to_owned(),
     };
     Ok(Rig { engine, info })

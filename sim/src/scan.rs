@@ -1,6 +1,7 @@
 //! The scanning motion: where the camera is meant to be over time, and the joint positions that bring it there.
 
 use crate::Error;
+use crate::cabinet_tour::CabinetTour;
 use crate::config::N_JOINTS;
 use crate::objects::{TABLE_Z_M, TARGET_XY_M};
 use crate::panda::{self, Jacobian, Joints};
@@ -70,19 +71,42 @@ impl Scan {
         let [look_x_m, look_y_m] = [&LOOK_X_M, &LOOK_Y_M].map(|swing| self.swing(swing, at));
         let target = Vector3::new(TARGET_XY_M[0] + look_x_m, TARGET_XY_M[1] + look_y_m, TABLE_Z_M + LOOK_ABOVE_M);
         let back = Vector3::new(-elevation.cos() * azimuth.cos(), -elevation.cos() * azimuth.sin(), elevation.sin());
-        let forward = -back;
-        let right = forward.cross(&Vector3::z()).normalize();
-        let axes = Matrix3::from_columns(&[right, forward.cross(&right), forward]);
-        let upright = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
+        let upright = looking_along(&-back);
         let roll = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), self.swing(&ROLL_DEGREES, at).to_radians());
         Transform::from_parts(Translation3::from(target + back * self.swing(&DISTANCE_M, at)), upright * roll)
+    }
+}
+
+/// Orientation of an upright camera that looks along a direction: x right, y down, z ahead.
+pub(crate) fn looking_along(forward: &Vector3<f64>) -> UnitQuaternion<f64> {
+    let right = forward.cross(&Vector3::z()).normalize();
+    let axes = Matrix3::from_columns(&[right, forward.cross(&right), *forward]);
+    UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes))
+}
+
+/// What an arm's camera does.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Tour {
+    /// Round the target area on the table.
+    Table(Scan),
+    /// From two stands, and into the cabinet.
+    Cabinet(CabinetTour),
+}
+
+impl Tour {
+    /// Where the camera should be, seen from the arm's own base.
+    pub(crate) fn arm_from_camera(&self, secs: f64) -> Transform {
+        match self {
+            Self::Table(scan) => scan.world_from_camera(secs),
+            Self::Cabinet(tour) => tour.arm_from_camera(secs),
+        }
     }
 }
 
 /// Follows the scan in joint space by damped least squares, inside the joint limits.
 #[derive(Clone, Debug)]
 pub(crate) struct Follower {
-    scan: Scan,
+    scan: Tour,
     flange_from_camera: Transform,
     position_rad: Joints,
     velocity_rad_s: Joints,
@@ -110,7 +134,7 @@ const BEND_SHARE: f64 = 0.6;
 
 impl Follower {
     /// Starts at rest, at the scan's first pose.
-    pub(crate) fn new(scan: Scan, flange_from_camera: Transform) -> Result<Self, Error> {
+    pub(crate) fn new(scan: Tour, flange_from_camera: Transform) -> Result<Self, Error> {
         const TOLERANCE: f64 = 0.02;
         let mut follower = Self {
             scan,
@@ -119,7 +143,7 @@ impl Follower {
             velocity_rad_s: Joints::zeros(),
             acceleration_rad_s2: Joints::zeros(),
         };
-        let wanted = scan.world_from_camera(0.0);
+        let wanted = scan.arm_from_camera(0.0);
         for _ in 0..3000 {
             let step = follower.wish(&wanted, &Vector6::zeros()) * 0.01;
             follower.position_rad = clamp_to_limits(follower.position_rad + step);
@@ -142,7 +166,7 @@ impl Follower {
             secs += STEP_SECS;
             self.advance(secs, STEP_SECS);
             let base_from_camera = panda::base_from_flange(&self.position_rad) * self.flange_from_camera;
-            let error = pose_error(&self.scan.world_from_camera(secs), &base_from_camera);
+            let error = pose_error(&self.scan.arm_from_camera(secs), &base_from_camera);
             worst_rad = worst_rad.max(error.fixed_rows::<3>(3).norm());
         }
         if worst_rad > TOLERANCE_RAD {
@@ -161,8 +185,8 @@ impl Follower {
 
     /// Moves on to a time, `step_secs` after the previous one.
     pub(crate) fn advance(&mut self, secs: f64, step_secs: f64) {
-        let wanted = self.scan.world_from_camera(secs);
-        let before = self.scan.world_from_camera(secs - step_secs);
+        let wanted = self.scan.arm_from_camera(secs);
+        let before = self.scan.arm_from_camera(secs - step_secs);
         let wanted_twist = pose_error(&wanted, &before) / step_secs;
         let wish = self.wish(&wanted, &wanted_twist);
         for ix in 0..N_JOINTS {

@@ -1,26 +1,46 @@
-//! The static-arm scene as a MuJoCo model.
+//! A scene and its robot as a MuJoCo model.
 
-use crate::config::{Config, Parent};
-use crate::objects::{Object, objects, textures};
+use crate::base;
+use crate::config::{Config, Parent, Scene};
+use crate::objects::{self, Object};
 use crate::texture::Texture;
-use crate::{Error, light, panda};
+use crate::{Error, cabinet, lab, light, panda};
 use mujoco_rs::prelude::MjModel;
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 use nalgebra::{Point3, Translation3};
+use rayon::prelude::{IntoParallelIterator, ParallelIterator};
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Group of the arm's geometry, so that it can be hidden.
 pub(crate) const ARM_GROUP: usize = 1;
+/// Group of the geometry that light passes through.
+pub(crate) const GLASS_GROUP: usize = 2;
+
 /// Nearest and furthest drawn distance, metres.
-pub(crate) const NEAR_FAR_M: [f64; 2] = [0.02, 12.0];
+pub(crate) fn near_far_m(scene: Scene) -> [f64; 2] {
+    match scene {
+        Scene::StaticArm | Scene::MobileArm => [0.02, 12.0],
+        Scene::MobileBase => [0.05, 25.0],
+    }
+}
+
+/// Factor on all lamps: rooms whose walls face away from the key lamp need more.
+fn brightness(scene: Scene) -> f64 {
+    match scene {
+        Scene::StaticArm => 1.0,
+        Scene::MobileBase => 1.35,
+        Scene::MobileArm => 1.15,
+    }
+}
 
 /// Builds the model for pictures of up to `largest_px`.
 pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Error> {
     let mut files = MjVfs::new();
-    let mut assets = String::from(MATERIALS);
+    let mut assets = format!("{MATERIALS}{}", more_materials(config.scene));
     let mut bodies = String::new();
-    let made = Made::get()?;
+    let made = Made::get(config.scene)?;
     for (name, png) in &made.textures_png {
         add_file(&mut files, &format!("{name}.png"), png)?;
         let specular = if *name == "metal" { 0.25 } else { 0.03 };
@@ -34,14 +54,16 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
         add_file(&mut files, &format!("{name}.msh"), &mesh.to_msh())?;
         let _ = writeln!(assets, "<mesh name=\"{name}\" file=\"{name}.msh\" inertia=\"shell\"/>");
         let pose = panda::pose_attributes(world_from_mesh);
-        let _ = writeln!(bodies, "<geom type=\"mesh\" mesh=\"{name}\" material=\"{material}\" {pose}/>");
+        let group = if *material == "glass" { GLASS_GROUP } else { 0 };
+        let _ =
+            writeln!(bodies, "<geom type=\"mesh\" mesh=\"{name}\" material=\"{material}\" group=\"{group}\" {pose}/>");
     }
-    let [near, far] = NEAR_FAR_M;
+    let [near, far] = near_far_m(config.scene);
     let [width, height] = largest_px;
-    let (lamps, ambient) = light::mjcf();
-    let arm = panda::mjcf(&brackets(config));
+    let (lamps, ambient) = light::mjcf(brightness(config.scene));
+    let robot = robot(config);
     let xml = format!(
-        "<mujoco model=\"static-arm\">\n\
+        "<mujoco model=\"{}\">\n\
          <compiler angle=\"radian\" autolimits=\"true\"/>\n\
          <option timestep=\"0.001\" integrator=\"implicitfast\"><flag contact=\"disable\"/></option>\n\
          <statistic extent=\"1\" center=\"0.7 0 0.2\"/>\n\
@@ -54,10 +76,44 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
          <default><geom contype=\"0\" conaffinity=\"0\" group=\"0\"/>\n\
          <default class=\"arm\"><geom contype=\"0\" conaffinity=\"0\" group=\"{ARM_GROUP}\" mass=\"0\"/></default></default>\n\
          <asset>\n{assets}</asset>\n\
-         <worldbody>\n{lamps}{bodies}{arm}</worldbody>\n</mujoco>\n"
+         <worldbody>\n{lamps}{bodies}{robot}</worldbody>\n</mujoco>\n",
+        config.scene.name()
     );
     add_file(&mut files, "scene.xml", xml.as_bytes())?;
     MjModel::from_xml_vfs("scene.xml", &files).map_err(|error| Error::Scene { reason: error.to_string() })
+}
+
+/// The robot as a body of the world: an arm alone, or a base that carries one or none.
+fn robot(config: &Config) -> String {
+    let arm = if config.scene.has_arm() { panda::mjcf(&brackets(config)) } else { String::new() };
+    if !config.scene.has_moving_base() {
+        return arm;
+    }
+    let mount = panda::pose_attributes(&base::base_from_arm());
+    format!(
+        "<body name=\"base\" mocap=\"true\" childclass=\"arm\">\n{QUADRUPED}<body name=\"mount\" {mount}>\n{arm}</body>\n</body>\n"
+    )
+}
+
+/// Body, legs and head of the quadruped, its middle at the origin.
+const QUADRUPED: &str = "<geom type=\"box\" size=\"0.38 0.13 0.08\" material=\"quadruped\"/>\n\
+     <geom type=\"box\" pos=\"0.42 0 0.02\" size=\"0.06 0.09 0.06\" material=\"arm_gray\"/>\n\
+     <geom type=\"cylinder\" pos=\"-0.2 0 0.13\" size=\"0.05 0.035\" material=\"arm_gray\"/>\n\
+     <geom type=\"capsule\" fromto=\"0.3 0.17 0 0.2 0.19 -0.26\" size=\"0.04\" material=\"quadruped\"/>\n\
+     <geom type=\"capsule\" fromto=\"0.2 0.19 -0.26 0.3 0.19 -0.49\" size=\"0.025\" material=\"arm_gray\"/>\n\
+     <geom type=\"capsule\" fromto=\"0.3 -0.17 0 0.2 -0.19 -0.26\" size=\"0.04\" material=\"quadruped\"/>\n\
+     <geom type=\"capsule\" fromto=\"0.2 -0.19 -0.26 0.3 -0.19 -0.49\" size=\"0.025\" material=\"arm_gray\"/>\n\
+     <geom type=\"capsule\" fromto=\"-0.3 0.17 0 -0.4 0.19 -0.26\" size=\"0.04\" material=\"quadruped\"/>\n\
+     <geom type=\"capsule\" fromto=\"-0.4 0.19 -0.26 -0.3 0.19 -0.49\" size=\"0.025\" material=\"arm_gray\"/>\n\
+     <geom type=\"capsule\" fromto=\"-0.3 -0.17 0 -0.4 -0.19 -0.26\" size=\"0.04\" material=\"quadruped\"/>\n\
+     <geom type=\"capsule\" fromto=\"-0.4 -0.19 -0.26 -0.3 -0.19 -0.49\" size=\"0.025\" material=\"arm_gray\"/>\n";
+
+fn more_materials(scene: Scene) -> &'static str {
+    match scene {
+        Scene::StaticArm => "",
+        Scene::MobileBase => lab::MATERIALS,
+        Scene::MobileArm => cabinet::MATERIALS,
+    }
 }
 
 /// What is made once a process, as it takes a second and no configuration changes it.
@@ -67,22 +123,30 @@ struct Made {
 }
 
 impl Made {
-    fn get() -> Result<Arc<Self>, Error> {
-        static MADE: Mutex<Option<Arc<Made>>> = Mutex::new(None);
-        let mut made = MADE.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(made) = &*made {
+    fn get(scene: Scene) -> Result<Arc<Self>, Error> {
+        static MADE: Mutex<BTreeMap<&str, Arc<Made>>> = Mutex::new(BTreeMap::new());
+        let mut all = MADE.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(made) = all.get(scene.name()) {
             return Ok(Arc::clone(made));
         }
         let encode = |(name, texture): (&'static str, Texture)| {
             texture.to_png().map(|png| (name, png)).map_err(|source| Error::Texture { name, source })
         };
-        let textures_png = textures().into_iter().map(encode).collect::<Result<_, _>>()?;
-        Ok(Arc::clone(made.insert(Arc::new(Self { textures_png, objects: objects() }))))
+        let (textures, objects) = match scene {
+            Scene::StaticArm => (objects::textures(), objects::objects()),
+            Scene::MobileBase => (lab::textures(), lab::objects()),
+            Scene::MobileArm => (cabinet::textures(), cabinet::objects()),
+        };
+        let textures_png = textures.into_par_iter().map(encode).collect::<Result<_, _>>()?;
+        let made = Arc::new(Self { textures_png, objects });
+        all.insert(scene.name(), Arc::clone(&made));
+        Ok(made)
     }
 }
 
 const MATERIALS: &str = "<material name=\"arm_white\" rgba=\"0.93 0.93 0.92 1\" specular=\"0.4\" shininess=\"0.6\"/>\n\
      <material name=\"arm_gray\" rgba=\"0.28 0.29 0.31 1\" specular=\"0.3\" shininess=\"0.5\"/>\n\
+     <material name=\"quadruped\" rgba=\"0.95 0.76 0.10 1\" specular=\"0.3\" shininess=\"0.5\"/>\n\
      <material name=\"frame\" rgba=\"0.20 0.21 0.23 1\" specular=\"0.1\"/>\n";
 
 fn add_file(files: &mut MjVfs, name: &str, bytes: &[u8]) -> Result<(), Error> {
@@ -129,6 +193,34 @@ mod tests {
                 assert!((pose.translation.vector - Vector3::from(data.xpos()[flange_ix])).norm() < TOLERANCE);
                 assert!(pose.rotation.angle_to(&turn) < 10.0 * TOLERANCE);
             }
+        }
+    }
+
+    #[test]
+    fn mujocos_moving_base_and_its_arm_are_where_our_urdfs_put_them() {
+        const TOLERANCE: f64 = 1e-9;
+        let names = |scene: Scene| if scene.has_arm() { Config::default().joint_names } else { Vec::new() };
+        for scene in [Scene::MobileBase, Scene::MobileArm] {
+            let mut config =
+                Config { scene, joint_names: names(scene), reading_order: names(scene), ..Config::default() };
+            if !scene.has_arm() {
+                config.cameras[0].parent = Parent::Base;
+            }
+            let model = build(&config, [64, 64]).expect("the scene is valid");
+            let tip = if scene.has_arm() { "panda_link8" } else { "mount" };
+            let chain = kinematics::Chain::from_urdf(crate::rig::urdf_of(scene), "base", tip).expect("valid");
+            let tip_ix = model.name_to_id(MjtObjBase::mjOBJ_BODY, tip).expect("a body");
+            let mut data = MjData::new(&model);
+            let position_rad: &[f64] = if scene.has_arm() { &[0.4, -0.9, 1.3, -2.2, -0.7, 1.8, 0.6] } else { &[] };
+            let world_from_base = crate::base::BaseMotion::of(scene, 1.0).world_from_base(16.3);
+            data.qpos_mut().copy_from_slice(position_rad);
+            crate::render::place_base(&mut data, &world_from_base);
+            data.forward_kinematics();
+            let expected = world_from_base * chain.forward(position_rad).expect("as many joints");
+            let [w, x, y, z] = data.xquat()[tip_ix];
+            let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+            assert!((expected.translation.vector - Vector3::from(data.xpos()[tip_ix])).norm() < TOLERANCE);
+            assert!(expected.rotation.angle_to(&turn) < 10.0 * TOLERANCE);
         }
     }
 }

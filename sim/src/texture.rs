@@ -18,7 +18,7 @@ pub(crate) struct Texture {
 
 impl Texture {
     /// Paints every pixel by its position, both coordinates from 0 to 1, from the top left.
-    fn paint(side_px: usize, color_at: impl Fn(f64, f64) -> Color + Sync) -> Self {
+    pub(crate) fn paint(side_px: usize, color_at: impl Fn(f64, f64) -> Color + Sync) -> Self {
         let at = |ix: usize| (ix as f64 + 0.5) / side_px as f64;
         let mut rgb = vec![0; 3 * side_px * side_px];
         rgb.par_chunks_mut(3 * side_px).enumerate().for_each(|(row, line)| {
@@ -79,7 +79,7 @@ impl Texture {
 }
 
 /// Side of every texture, pixels.
-const SIDE_PX: usize = 1024;
+pub(crate) const SIDE_PX: usize = 1024;
 
 /// How far from a rectangle's edge light is told at the least, as a share of its side.
 const EDGE: f64 = 0.005;
@@ -99,26 +99,26 @@ fn to_byte(value: f64) -> u8 {
     (value.clamp(0.0, 1.0) * 255.0 + 0.5) as u8
 }
 
-fn mix(a: Color, b: Color, share: f64) -> Color {
+pub(crate) fn mix(a: Color, b: Color, share: f64) -> Color {
     let share = share.clamp(0.0, 1.0);
     std::array::from_fn(|ix| a[ix] + (b[ix] - a[ix]) * share)
 }
 
-fn scale(color: Color, factor: f64) -> Color {
+pub(crate) fn scale(color: Color, factor: f64) -> Color {
     color.map(|channel| channel * factor)
 }
 
 /// 0 below `lower`, 1 above `upper`, smooth between.
-fn step(lower: f64, upper: f64, value: f64) -> f64 {
+pub(crate) fn step(lower: f64, upper: f64, value: f64) -> f64 {
     let share = ((value - lower) / (upper - lower)).clamp(0.0, 1.0);
     share * share * (3.0 - 2.0 * share)
 }
 
 /// Smooth noise, 0 to 1, with features of size 1.
-struct Noise(Random);
+pub(crate) struct Noise(Random);
 
 impl Noise {
-    fn new(name: u64) -> Self {
+    pub(crate) fn new(name: u64) -> Self {
         Self(Random::new(0x7e37, &[name]))
     }
 
@@ -126,7 +126,7 @@ impl Noise {
         self.0.unit((x as u64) << 32 ^ (y as u64 & 0xffff_ffff))
     }
 
-    fn at(&self, x: f64, y: f64) -> f64 {
+    pub(crate) fn at(&self, x: f64, y: f64) -> f64 {
         let (column, row) = (x.floor(), y.floor());
         let (fx, fy) = (step(0.0, 1.0, x - column), step(0.0, 1.0, y - row));
         let (column, row) = (column as i64, row as i64);
@@ -136,7 +136,7 @@ impl Noise {
     }
 
     /// Noise of several sizes, each half as large and half as strong, 0 to 1.
-    fn rough(&self, x: f64, y: f64, n_octaves: i32) -> f64 {
+    pub(crate) fn rough(&self, x: f64, y: f64, n_octaves: i32) -> f64 {
         let octaves = (0..n_octaves).map(|octave| (f64::from(octave) * 17.3, 2f64.powi(octave)));
         let sum: f64 = octaves.map(|(shift, finer)| self.at(x * finer + shift, y * finer + shift) / finer).sum();
         sum / (2.0 - 2f64.powi(1 - n_octaves))
@@ -196,7 +196,7 @@ fn poster(x: f64, y: f64, rectangle: [f64; 4], wall: Color, picture: impl Fn(f64
     }
 }
 
-fn sunrise(u: f64, v: f64) -> Color {
+pub(crate) fn sunrise(u: f64, v: f64) -> Color {
     let (dx, dy) = (u - 0.5, v - 0.42);
     let distance = dx.hypot(dy);
     let ray = ((dy.atan2(dx) * 16.0 / std::f64::consts::TAU).rem_euclid(1.0) - 0.5).abs();
@@ -208,7 +208,7 @@ fn sunrise(u: f64, v: f64) -> Color {
     if v > front { [0.07, 0.16, 0.24] } else { color }
 }
 
-fn squares(u: f64, v: f64) -> Color {
+pub(crate) fn squares(u: f64, v: f64) -> Color {
     const COLORS: [Color; 6] = [
         [0.85, 0.15, 0.15],
         [0.10, 0.30, 0.70],
@@ -225,7 +225,7 @@ fn squares(u: f64, v: f64) -> Color {
     if from_center < 0.36 { pick(cell + 100) } else { pick(cell) }
 }
 
-fn map(noise: &Noise, u: f64, v: f64) -> Color {
+pub(crate) fn map(noise: &Noise, u: f64, v: f64) -> Color {
     let height = noise.rough(u * 3.0 + 40.0, v * 3.0, 5);
     let contour = ((height * 24.0).fract() - 0.5).abs();
     let land = mix([0.55, 0.72, 0.40], [0.80, 0.66, 0.42], step(0.5, 0.7, height));
@@ -235,7 +235,7 @@ fn map(noise: &Noise, u: f64, v: f64) -> Color {
     if grid > 0.485 { [0.15, 0.15, 0.20] } else { color }
 }
 
-fn stripes(u: f64, v: f64) -> Color {
+pub(crate) fn stripes(u: f64, v: f64) -> Color {
     let wave = v * 9.0 + 0.5 * (u * 11.0).sin() + 0.2 * (u * 27.0).cos();
     let colors: [Color; 4] = [[0.12, 0.14, 0.30], [0.92, 0.88, 0.78], [0.80, 0.25, 0.30], [0.25, 0.55, 0.62]];
     let color = colors[wave.floor().rem_euclid(4.0) as usize];

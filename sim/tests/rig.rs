@@ -28,7 +28,7 @@ fn play(config: &Config) -> Run {
             Sample::Image(image) => run.depth.push(image),
             Sample::Truth(truth) => run.truth.push(truth),
             Sample::Joints(state) => run.joints.push(state),
-            Sample::Base(_) => panic!("a static arm has no base poses"),
+            Sample::Base(_) | Sample::BaseTruth(_) | Sample::Range(_) => panic!("a static arm has neither"),
         }
     }
     run

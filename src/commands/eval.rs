@@ -1,5 +1,6 @@
 //! `fieldrig eval`: how good a saved model is on the test images of some data.
 
+use crate::config::Rig;
 use crate::data::{Data, DataArgs, Purpose};
 use crate::evaluate::{Evaluator, ImageScores, Scores};
 use crate::exit::{self, Exit};
@@ -51,6 +52,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if n_trained_on > 0 {
         log::warn!("the model was trained on {n_trained_on} of the {} images that are scored", tests.len());
     }
+    if data.rig.as_ref().is_some_and(|rig| is_other_rig(rig, &args.model)) {
+        log::warn!(
+            "the model was trained with another rig file: what it knows about cameras corrects that one; see --rig"
+        );
+    }
     let mut model = method::load(super::open_gpu()?, &args.model)?;
     let images = evaluator.score_all(model.as_mut(), &tests)?;
     let scores = Scores::mean(&images);
@@ -66,6 +72,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         print::line(format_args!("{:30} {scores}", format!("mean of {}", per_image.len())))?;
     }
     Ok(exit::after(&data.losses))
+}
+
+/// Whether the cameras of a rig are not those that the model was trained with, as the rig file in its folder has them.
+fn is_other_rig(rig: &Rig, model: &Path) -> bool {
+    let trained_with = Rig::load(&model.join(drivers::recording::RIG_FILE), &[]);
+    trained_with.is_ok_and(|trained_with| !rig.sees_like(&trained_with))
 }
 
 /// How many of the images to score the model was trained on, as the list in its folder says; 0 where there is none.

@@ -46,6 +46,7 @@ struct Recorded {
     lost: BTreeMap<String, Lost>,
     joint_states: u64,
     base_poses: u64,
+    range_scans: u64,
     truths: u64,
     out: PathBuf,
 }
@@ -67,7 +68,10 @@ impl Recorded {
             }
             Sample::Joints(_) => self.joint_states += 1,
             Sample::Base(_) => self.base_poses += 1,
+            Sample::Range(_) => self.range_scans += 1,
             Sample::Truth(_) => self.truths += 1,
+            // Comes with every base pose.
+            Sample::BaseTruth(_) => {}
         }
     }
 

@@ -85,6 +85,9 @@ struct Particulars {
     evicted: u64,
     refused: BTreeMap<&'static str, u64>,
     device_skipped: u64,
+    /// Turns of range scanners in the list beside the keyframes, and their points.
+    range_scans: usize,
+    range_points: usize,
     losses: Vec<String>,
     /// Largest distance of a keyframe's camera from its true place, metres; in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -168,6 +171,8 @@ fn save(live: Live, args: &Args, rig: &Rig, out: &Path, damage: &OnceLock<String
         evicted: counts.evicted,
         refused: counts.refused.iter().map(|(why, n)| (why.name(), *n)).collect(),
         device_skipped: counts.device_skipped,
+        range_scans: leftover.join.range_scans().count(),
+        range_points: leftover.join.range_scans().map(|scan| scan.points_in_world_m.len()).sum(),
         losses,
         worst_position_error_m: live_error_m,
     };

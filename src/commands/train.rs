@@ -56,7 +56,7 @@ pub(crate) struct Args {
     /// Where the results go; a folder that holds a model is refused [default: the folder of --resume if it holds none, else a new one in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
-    /// Write the recording's rig file here with what was found about its cameras
+    /// Write the recording's rig file here with what was found about its cameras, and the robot's description (robot.urdf) beside it
     #[arg(long, value_name = "FILE")]
     write_rig: Option<PathBuf>,
     #[command(flatten)]
@@ -104,11 +104,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         None => Data::load(&args.data, &args.images, Purpose::Training, &args.training.overrides(), args.json)?,
     };
     if let Some(file) = &args.write_rig {
-        if data.rig.is_none() {
+        let Some(rig) = &data.rig else {
             let data = args.data.display();
             return Err(BadArgument(format!("--write-rig: {data} holds no rig file; recordings do")).into());
-        }
-        corrected_rig::refuse_place(file)?; // Not after all the training.
+        };
+        corrected_rig::refuse_place(rig, file)?; // Not after all the training.
     }
     let gpu = super::open_gpu()?;
     let Resumed { kind, mut method, options, rest } = match &checkpoint {
@@ -158,9 +158,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     };
 
     let alignment = session.alignment().cloned();
-    if let Some(file) = &args.write_rig {
-        write_rig(&Data::rig_as_given(&args.data, &args.images)?, alignment.as_ref(), file)?;
-    }
     let startup_secs = session.clock_started().map_or(0.0, |at| (at - started).as_secs_f64());
     session.finish(
         &out,
@@ -173,9 +170,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             n_selection: data.of_split(Split::Selection).len(),
             n_test: data.of_split(Split::Test).len(),
             losses: &data.losses,
-            alignment,
+            alignment: alignment.clone(),
         },
     )?;
+    if let Some(file) = &args.write_rig {
+        write_rig(&Data::rig_as_given(&args.data, &args.images)?, alignment.as_ref(), file)?;
+    }
     Ok(exit::after(&data.losses))
 }
 
@@ -183,6 +183,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 fn write_rig(rig: &Rig, alignment: Option<&Alignment>, file: &Path) -> anyhow::Result<()> {
     match alignment {
         None => log::warn!("images were not laid over each other: the rig file is written as it was"),
+        Some(alignment) if !alignment.is_judged() => {
+            log::warn!("too few images to judge by were held back: the rig file is written as it was");
+        }
         Some(alignment) if !alignment.is_any() => log::info!("the rig file needs no correction"),
         Some(_) => {}
     }

@@ -32,6 +32,8 @@ pub(crate) struct Rig {
     pub(crate) base: Base,
     /// By name.
     pub(crate) cameras: Vec<Camera>,
+    /// Range scanners, by name.
+    pub(crate) scanners: Vec<Scanner>,
     pub(crate) join: JoinConfig,
     pub(crate) train: Train,
     pub(crate) sim: Sim,
@@ -67,6 +69,11 @@ pub(crate) enum ArmDriver {
 pub(crate) struct Base {
     pub(crate) driver: BaseDriver,
     pub(crate) world_from_base: Transform,
+    /// Poses a second where the base moves.
+    pub(crate) rate_hz: f64,
+    /// Error of a simulated base's poses at the end of its walk, root mean square, metres and radians.
+    pub(crate) drift_m: f64,
+    pub(crate) drift_rad: f64,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -76,6 +83,38 @@ pub(crate) enum BaseDriver {
     Rgbd,
     Udp,
     Sim,
+}
+
+/// A range scanner that turns about its z axis.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Scanner {
+    pub(crate) name: Arc<str>,
+    pub(crate) driver: ScannerDriver,
+    /// Turns a second.
+    pub(crate) rate_hz: f64,
+    /// Pose on the base: x ahead, z up.
+    pub(crate) base_from_scanner: Transform,
+    /// Echoes outside count as nothing seen.
+    pub(crate) min_m: f64,
+    pub(crate) max_m: f64,
+    pub(crate) sim: ScannerSim,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum ScannerDriver {
+    Udp,
+    Sim,
+}
+
+/// What a simulated scanner measures, and its flaws.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct ScannerSim {
+    pub(crate) rings: u32,
+    pub(crate) columns: u32,
+    pub(crate) lowest_rad: f64,
+    pub(crate) highest_rad: f64,
+    pub(crate) noise_sigma_m: f64,
+    pub(crate) dropped_frac: f64,
 }
 
 /// One camera, colour and, where it has that, depth.
@@ -170,6 +209,7 @@ pub(crate) struct JoinConfig {
     pub(crate) default_depth_m: f64,
     pub(crate) max_gap_millis: f64,
     pub(crate) max_wait_millis: f64,
+    pub(crate) max_range_scans: usize,
 }
 
 /// How the model is trained.
@@ -198,6 +238,8 @@ pub(crate) struct Sim {
     pub(crate) n_images: Option<u64>,
     pub(crate) truth: bool,
     pub(crate) truth_depth: bool,
+    /// Brightness of the lamps once the arm's camera is inside the cabinet, relative to outside.
+    pub(crate) light_inside_frac: f64,
 }
 
 /// A value from the command line that replaces a key of the rig file.
@@ -232,6 +274,25 @@ impl Rig {
     /// The settled rig file: every key, so that it gives the same rig again. The robot's description lies beside it.
     pub(crate) fn to_toml(&self) -> String {
         write::rig(self)
+    }
+
+    /// Whether its cameras see the same of the same readings: where they sit, their lenses, delays and depth, and the joints' zeros.
+    pub(crate) fn sees_like(&self, other: &Self) -> bool {
+        const SAME: f64 = 1e-9; // Reading a pose back may turn its last bit.
+        let is_same = |one: &Camera, other: &Camera| {
+            let apart = one.parent_from_camera.inverse() * other.parent_from_camera;
+            one.name == other.name
+                && one.parent == other.parent
+                && apart.translation.vector.norm() < SAME
+                && apart.rotation.angle() < SAME
+                && one.intrinsics == other.intrinsics
+                && one.stamp_to_mid_exposure == other.stamp_to_mid_exposure
+                && one.readout_micros == other.readout_micros
+                && one.depth == other.depth
+        };
+        self.arm.joint_offsets == other.arm.joint_offsets
+            && self.cameras.len() == other.cameras.len()
+            && self.cameras.iter().zip(&other.cameras).all(|(one, other)| is_same(one, other))
     }
 
     /// Writes the settled rig file and the robot's description into a folder, and says where the rig file is.

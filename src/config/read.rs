@@ -3,7 +3,7 @@
 use super::section::{Reading, Section};
 use super::{
     Arm, ArmDriver, Base, BaseDriver, Camera, CameraDriver, CameraSim, ConfigError, Depth, JoinConfig, MAX_BYTES,
-    MAX_SPLATS, Measured, Override, Parent, Rig, SEED, Sim, Train, USUAL_SEED,
+    MAX_SPLATS, Measured, Override, Parent, Rig, SEED, Scanner, ScannerDriver, ScannerSim, Sim, Train, USUAL_SEED,
 };
 use kinematics::{Chain, Intrinsics, Lens, Transform};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
@@ -24,6 +24,8 @@ pub(super) const CAMERA_DRIVERS: [(&str, CameraDriver); 4] = [
     ("nokhwa", CameraDriver::Nokhwa),
     ("sim", CameraDriver::Sim),
 ];
+pub(super) const SCANNER_DRIVERS: [(&str, ScannerDriver); 2] =
+    [("udp", ScannerDriver::Udp), ("sim", ScannerDriver::Sim)];
 pub(super) const PARENTS: [(&str, Parent); 3] =
     [("flange", Parent::Flange), ("base", Parent::Base), ("world", Parent::World)];
 const METHODS: [(&str, &str); 2] = [("splat", "splat"), ("tsdf", "tsdf")];
@@ -63,11 +65,12 @@ pub(super) fn keys(file: &str, text: &str, overrides: &[Override]) -> Result<(Ri
     let (arm, urdf_path) = arm(root.section("arm"));
     let base = base(root.section("base"));
     let cameras = cameras(&mut root);
+    let scanners = root.named_sections("range").into_iter().map(|(name, keys)| scanner(&name, keys)).collect();
     let join = join(root.section("join"));
     let train = train(root.section("train"));
     let sim = sim(root.section("sim"));
     root.end();
-    Ok((Rig { arm, base, cameras, join, train, sim }, urdf_path, reading))
+    Ok((Rig { arm, base, cameras, scanners, join, train, sim }, urdf_path, reading))
 }
 
 /// Replaces the value of a dotted key, making tables on the way.
@@ -134,12 +137,57 @@ fn arm(mut keys: Section<'_>) -> (Arm, String) {
 }
 
 fn base(mut keys: Section<'_>) -> Base {
+    let mut flaws = keys.section("sim");
+    let (drift_m, drift_rad) = (flaws.number("drift_m", 0.0..=10.0), flaws.number("drift_rad", 0.0..=1.0));
+    flaws.end();
     let base = Base {
         driver: keys.choice("driver", &BASE_DRIVERS).unwrap_or(BaseDriver::Fixed),
         world_from_base: pose(&mut keys, "world_from_base").unwrap_or_else(Transform::identity),
+        rate_hz: keys.number("rate_hz", 1.0..=1000.0).unwrap_or(100.0),
+        drift_m: drift_m.unwrap_or(0.02),
+        drift_rad: drift_rad.unwrap_or(0.0175),
     };
     keys.end();
     base
+}
+
+fn scanner(name: &str, mut keys: Section<'_>) -> Scanner {
+    check_name(name, &keys);
+    let driver = keys.choice("driver", &SCANNER_DRIVERS);
+    if driver.is_none() {
+        keys.missing("driver", "udp or sim");
+    }
+    let mut sim = keys.section("sim");
+    let lowest_rad = sim.number("lowest_rad", -1.57..=1.57).unwrap_or(-0.2618);
+    let scanner_sim = ScannerSim {
+        rings: sim.whole("rings", 1..=256).map_or(16, small),
+        columns: sim.whole("columns", 4..=4096).map_or(900, small),
+        lowest_rad,
+        highest_rad: sim.number("highest_rad", lowest_rad..=1.57).unwrap_or(lowest_rad.max(0.2618)),
+        noise_sigma_m: sim.number("noise_sigma_m", 0.0..=1.0).unwrap_or(0.02),
+        dropped_frac: sim.number("dropped_frac", 0.0..=0.9).unwrap_or(0.01),
+    };
+    sim.end();
+    let min_m = keys.number("min_m", 0.0..=100.0).unwrap_or(0.4);
+    let scanner = Scanner {
+        name: name.into(),
+        driver: driver.unwrap_or(ScannerDriver::Sim),
+        rate_hz: keys.number("rate_hz", 0.1..=50.0).unwrap_or(10.0),
+        base_from_scanner: pose(&mut keys, "base_from_scanner").unwrap_or_else(Transform::identity),
+        min_m,
+        max_m: keys.number("max_m", min_m..=1000.0).unwrap_or(min_m.max(50.0)),
+        sim: scanner_sim,
+    };
+    keys.end();
+    scanner
+}
+
+/// Names become names of frames and topics.
+fn check_name(name: &str, keys: &Section<'_>) {
+    let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+    if name.is_empty() || !name.chars().all(plain) {
+        keys.wrong::<()>("name", &Value::String(name.to_owned()), "letters, digits, _ and -");
+    }
 }
 
 fn cameras(root: &mut Section<'_>) -> Vec<Camera> {
@@ -151,10 +199,7 @@ fn cameras(root: &mut Section<'_>) -> Vec<Camera> {
 }
 
 fn camera(name: &str, mut keys: Section<'_>) -> Camera {
-    let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
-    if name.is_empty() || !name.chars().all(plain) {
-        keys.wrong::<()>("name", &Value::String(name.to_owned()), "letters, digits, _ and -");
-    }
+    check_name(name, &keys);
     let driver = keys.choice("driver", &CAMERA_DRIVERS);
     if driver.is_none() {
         keys.missing("driver", "realsense, v4l2, nokhwa or sim");
@@ -311,6 +356,7 @@ fn join(mut keys: Section<'_>) -> JoinConfig {
         default_depth_m: keys.number("default_depth_m", 0.01..=1000.0).unwrap_or(0.5),
         max_gap_millis: keys.number("max_gap_millis", 0.1..=10_000.0).unwrap_or(50.0),
         max_wait_millis: keys.number("max_wait_millis", 1.0..=60_000.0).unwrap_or(500.0),
+        max_range_scans: keys.whole("max_range_scans", 0..=1_000_000).map_or(200, count),
     };
     keys.end();
     join
@@ -341,6 +387,7 @@ fn sim(mut keys: Section<'_>) -> Sim {
         n_images: keys.whole("n_images", 1..=1_000_000_000),
         truth: keys.flag("truth").unwrap_or(true),
         truth_depth: keys.flag("truth_depth").unwrap_or(false),
+        light_inside_frac: keys.number("light_inside_frac", 0.0..=4.0).unwrap_or(1.0),
     };
     keys.end();
     sim

@@ -34,6 +34,9 @@ intrinsics = { focal_px = [300, 300], principal_px = [160.0, 120.0], lens = "bro
 [join]
 [train]
 [sim]
+[range.lidar]
+driver = "udp"
+[range.lidar.sim]
 "#;
 
 fn parse(text: &str, overrides: &[Override]) -> Result<Rig, ConfigError> {
@@ -46,7 +49,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a good value that differs from the one in force, and a value that is not allowed.
-const KEYS: [(&str, &str, &str); 85] = [
+const KEYS: [(&str, &str, &str); 103] = [
     ("arm.driver", "'franka'", "'frankka'"),
     ("arm.address", "'172.16.0.2'", "7"),
     ("arm.urdf", "'other.urdf'", "7"),
@@ -58,6 +61,21 @@ const KEYS: [(&str, &str, &str); 85] = [
     ("base.driver", "'tags'", "'floating'"),
     ("base.world_from_base.xyz_m", "[1, 0, 0]", "[1, 0]"),
     ("base.world_from_base.quat_xyzw", "[1, 0, 0, 0]", "[1, 1, 0, 0]"),
+    ("base.rate_hz", "50", "0"),
+    ("base.sim.drift_m", "0.1", "-0.1"),
+    ("base.sim.drift_rad", "0.05", "2"),
+    ("range.lidar.driver", "'sim'", "'laser'"),
+    ("range.lidar.rate_hz", "5", "0"),
+    ("range.lidar.base_from_scanner.xyz_m", "[0, 0, 0.2]", "[0, 0]"),
+    ("range.lidar.base_from_scanner.quat_xyzw", "[0, 1, 0, 0]", "[0, 0, 0, 0]"),
+    ("range.lidar.min_m", "0.2", "-0.2"),
+    ("range.lidar.max_m", "30", "0.1"),
+    ("range.lidar.sim.rings", "32", "0"),
+    ("range.lidar.sim.columns", "360", "3"),
+    ("range.lidar.sim.lowest_rad", "-0.4", "-2"),
+    ("range.lidar.sim.highest_rad", "0.4", "2"),
+    ("range.lidar.sim.noise_sigma_m", "0.01", "-1"),
+    ("range.lidar.sim.dropped_frac", "0.1", "1"),
     ("camera.wrist.driver", "'realsense'", "'webcam'"),
     ("camera.wrist.device", "'/dev/video7'", "7"),
     ("camera.wrist.size_px", "[800, 600]", "[640, 480.5]"),
@@ -111,6 +129,7 @@ const KEYS: [(&str, &str, &str); 85] = [
     ("join.default_depth_m", "2", "0"),
     ("join.max_gap_millis", "20", "0"),
     ("join.max_wait_millis", "100", "0"),
+("join.max_range_scans", "50", "-1"),
     ("train.method", "'tsdf'", "'nerf'"),
     ("train.max_splats", "1_500_000", "0"),
     ("train.max_bytes", "100_000_000", "1"),
@@ -127,8 +146,10 @@ const KEYS: [(&str, &str, &str); 85] = [
     ("sim.n_images", "300", "0"),
     ("sim.truth", "false", "0"),
     ("sim.truth_depth", "true", "0"),
+    ("sim.light_inside_frac", "0.5", "-1"),
     // The same keys by the names of whole tables: a flag may replace a table too.
     ("base.world_from_base", "{ xyz_m = [1, 2, 3] }", "3"),
+    ("range.lidar.base_from_scanner", "{ xyz_m = [1, 2, 3] }", "3"),
     ("camera.wrist.stamp_to_mid_exposure_millis", "{ value = 2 }", "2"),
     ("camera.wrist.parent_from_camera", "{ xyz_m = [1, 2, 3] }", "[1, 2, 3]"),
     ("camera.wrist.depth", "{ min_m = 0.3 }", "true"),
@@ -183,7 +204,10 @@ fn the_documentation_lists_exactly_the_keys_there_are() {
     let listed: BTreeSet<String> = documented.keys().cloned().collect();
     assert_eq!(listed.difference(&known).collect::<Vec<_>>(), Vec::<&String>::new(), "documented, but not read");
     assert_eq!(known.difference(&listed).collect::<Vec<_>>(), Vec::<&String>::new(), "read, but not documented");
-    let tested: BTreeSet<String> = KEYS.iter().map(|(key, ..)| key.replace("camera.wrist", "camera.NAME")).collect();
+    let tested: BTreeSet<String> = KEYS
+        .iter()
+        .map(|(key, ..)| key.replace("camera.wrist", "camera.NAME").replace("range.lidar", "range.NAME"))
+        .collect();
     assert_eq!(known.difference(&tested).collect::<Vec<_>>(), Vec::<&String>::new(), "read, but not tested above");
     for (key, line) in documented {
         let cells = line.split('|').filter(|cell| !cell.trim().is_empty()).count();
@@ -211,7 +235,7 @@ fn the_defaults_of_the_documentation_are_the_defaults() {
         assert_eq!(cells[3].parse::<f64>().expect("a number in the documentation"), number, "{key}");
         n_checked += 1;
     }
-    assert_eq!(n_checked, 25, "[join] and [camera.NAME.sim]");
+    assert_eq!(n_checked, 26, "[join] and [camera.NAME.sim]");
 }
 
 #[test]

@@ -1,17 +1,20 @@
 //! The settled rig file: every key of a checked rig, written so that reading it gives the same rig.
 
-use super::read::{ARM_DRIVERS, BASE_DRIVERS, CAMERA_DRIVERS, PARENTS};
-use super::{Arm, Base, Camera, CameraSim, Depth, JoinConfig, Rig, Sim, Train};
+use super::read::{ARM_DRIVERS, BASE_DRIVERS, CAMERA_DRIVERS, PARENTS, SCANNER_DRIVERS};
+use super::{Arm, Base, Camera, CameraSim, Depth, JoinConfig, Rig, Scanner, Sim, Train};
 use kinematics::{Intrinsics, Lens, Transform};
 use toml::{Table, Value};
 
 pub(super) fn rig(rig: &Rig) -> String {
     let cameras =
         rig.cameras.iter().map(|camera| (camera.name.to_string(), Value::Table(self::camera(camera)))).collect();
+    let scanners =
+        rig.scanners.iter().map(|scanner| (scanner.name.to_string(), Value::Table(self::scanner(scanner)))).collect();
     let file = table([
         ("arm", Some(Value::Table(arm(&rig.arm)))),
         ("base", Some(Value::Table(base(&rig.base)))),
         ("camera", Some(Value::Table(cameras))),
+        ("range", Some(Value::Table(scanners))),
         ("join", Some(Value::Table(join(&rig.join)))),
         ("train", Some(Value::Table(train(&rig.train)))),
         ("sim", Some(Value::Table(sim(&rig.sim)))),
@@ -51,7 +54,32 @@ fn arm(arm: &Arm) -> Table {
 }
 
 fn base(base: &Base) -> Table {
-    table([("driver", name_of(&BASE_DRIVERS, &base.driver)), ("world_from_base", pose(&base.world_from_base))])
+    let sim = table([("drift_m", is(base.drift_m)), ("drift_rad", is(base.drift_rad))]);
+    table([
+        ("driver", name_of(&BASE_DRIVERS, &base.driver)),
+        ("world_from_base", pose(&base.world_from_base)),
+        ("rate_hz", is(base.rate_hz)),
+        ("sim", Some(Value::Table(sim))),
+    ])
+}
+
+fn scanner(scanner: &Scanner) -> Table {
+    let sim = table([
+        ("rings", whole(scanner.sim.rings.into())),
+        ("columns", whole(scanner.sim.columns.into())),
+        ("lowest_rad", is(scanner.sim.lowest_rad)),
+        ("highest_rad", is(scanner.sim.highest_rad)),
+        ("noise_sigma_m", is(scanner.sim.noise_sigma_m)),
+        ("dropped_frac", is(scanner.sim.dropped_frac)),
+    ]);
+    table([
+        ("driver", name_of(&SCANNER_DRIVERS, &scanner.driver)),
+        ("rate_hz", is(scanner.rate_hz)),
+        ("base_from_scanner", pose(&scanner.base_from_scanner)),
+        ("min_m", is(scanner.min_m)),
+        ("max_m", is(scanner.max_m)),
+        ("sim", Some(Value::Table(sim))),
+    ])
 }
 
 fn camera(camera: &Camera) -> Table {
@@ -123,6 +151,7 @@ fn join(join: &JoinConfig) -> Table {
         ("default_depth_m", is(join.default_depth_m)),
         ("max_gap_millis", is(join.max_gap_millis)),
         ("max_wait_millis", is(join.max_wait_millis)),
+        ("max_range_scans", whole(join.max_range_scans as u64)),
     ])
 }
 
@@ -149,6 +178,7 @@ fn sim(sim: &Sim) -> Table {
         ("n_images", sim.n_images.and_then(whole)),
         ("truth", is(sim.truth)),
         ("truth_depth", is(sim.truth_depth)),
+        ("light_inside_frac", is(sim.light_inside_frac)),
     ])
 }
 

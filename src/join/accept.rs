@@ -6,7 +6,7 @@ use super::motion::{self, Posed};
 use super::pixels::{PixelFacts, SharpnessMemory};
 use super::refusal::Refusal;
 use super::spacing::Spacing;
-use crate::config::{self, JoinConfig, Parent};
+use crate::config::{self, JoinConfig};
 use kinematics::{Intrinsics, Stamp, Transform};
 
 /// The acceptance test of one camera.
@@ -23,11 +23,12 @@ pub(super) struct Acceptance {
 }
 
 impl Acceptance {
-    pub(super) fn new(config: &JoinConfig, camera: &config::Camera, spacing: Spacing) -> Self {
+    /// `is_fixed`: the camera never moves.
+    pub(super) fn new(config: &JoinConfig, camera: &config::Camera, is_fixed: bool, spacing: Spacing) -> Self {
         Self {
             config: config.clone(),
             spacing,
-            is_fixed: camera.parent != Parent::Flange,
+            is_fixed,
             readout_secs: camera.readout_micros.unwrap_or(0.0) * 1e-6,
             accepted: Vec::new(),
             last: None,
@@ -103,7 +104,8 @@ mod tests {
             let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
             let rig = Rig::load(&path, &[Override::new("camera.wrist.readout_micros", readout_micros)]).expect("a rig");
             let camera = &rig.cameras[0];
-            let acceptance = Acceptance::new(&rig.join, camera, Spacing { translation_m: 1.0, rotation_rad: 1.0 });
+            let acceptance =
+                Acceptance::new(&rig.join, camera, false, Spacing { translation_m: 1.0, rotation_rad: 1.0 });
             let judge = |twist| {
                 let posed = Posed { world_from_camera: Transform::identity(), twist, joint_twists: [].into() };
                 acceptance.judge_speed(&posed, &camera.intrinsics, Some(0.01), 0.5)

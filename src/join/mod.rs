@@ -8,6 +8,7 @@ mod assemble;
 mod list;
 mod motion;
 mod pixels;
+mod ranges;
 mod refusal;
 mod spacing;
 mod store;
@@ -18,7 +19,7 @@ mod waiting;
 pub(crate) use list::{KeyframeList, split_name, split_named, text_of as keyframe_list};
 pub(crate) use refusal::{Counts, Refusal, Use};
 
-use crate::config::{self, CameraDriver, Parent, Rig};
+use crate::config::{self, BaseDriver, CameraDriver, Parent, Rig};
 use crate::exit::LackOfEvidence;
 use accept::Acceptance;
 use anyhow::Context;
@@ -26,10 +27,11 @@ use assemble::Lens;
 use drivers::{Image, Sample, TruthImage};
 use kinematics::{HistoryError, Stamp, Transform};
 use motion::{Motion, Posed};
+use ranges::Ranges;
 use spacing::Spacing;
 use std::sync::Arc;
 use store::KeyframeStore;
-use trainer::{Keyframe, Split};
+use trainer::{Keyframe, RangePoints, Split};
 use waiting::{Partner, Waiting};
 
 /// Makes keyframes of samples.
@@ -37,6 +39,7 @@ pub(crate) struct Join {
     motion: Motion,
     cameras: Vec<CameraState>,
     store: KeyframeStore,
+    ranges: Ranges,
     list: Option<KeyframeList>,
     /// The first image that was asked about the list.
     first_seen: Option<(Arc<str>, Stamp)>,
@@ -101,6 +104,7 @@ impl Join {
                 .map(|camera| CameraState::new(camera, rig, spacing))
                 .collect::<Result<_, _>>()?,
             store: KeyframeStore::new(join.max_keyframes, join.max_bytes, spacing),
+            ranges: Ranges::new(rig),
             list: None,
             first_seen: None,
             counts: Counts::default(),
@@ -130,6 +134,12 @@ impl Join {
                 let sensible = self.motion.push_base(&pose);
                 self.counts.base_poses_refused += u64::from(!sensible);
             }
+            Sample::Range(scan) => {
+                let kept_all = self.ranges.push(scan);
+                self.counts.range_scans_refused += u64::from(!kept_all);
+            }
+            // The truth about keyframes comes with their images.
+            Sample::BaseTruth(_) => {}
             Sample::Image(image) => self.push_image(image, &mut events),
             Sample::Truth(truth) => {
                 if let Some(camera) = self.cameras.iter_mut().find(|camera| camera.config.name == truth.image.camera) {
@@ -158,6 +168,11 @@ impl Join {
         self.store.iter()
     }
 
+    /// The newest turns of range scanners, with every point in the world, oldest first.
+    pub(crate) fn range_scans(&self) -> impl Iterator<Item = &Arc<RangePoints>> {
+        self.ranges.iter()
+    }
+
     /// What of the list could not be had, as [`KeyframeList::check_found`] tells it.
     pub(crate) fn check_list(&self) -> Result<Option<String>, LackOfEvidence> {
         let Some(list) = &self.list else { return Ok(None) };
@@ -184,8 +199,11 @@ impl Join {
         }
     }
 
-    /// Decides about every image that is ripe, oldest first, camera by camera.
+    /// Places the turns of scanners, then decides about every image that is ripe, oldest first, camera by camera.
     fn settle(&mut self, at_end: bool, events: &mut Vec<JoinEvent>) {
+        let settled = self.ranges.settle(&self.motion, self.newest, at_end, self.max_wait_secs);
+        self.counts.range_scans += settled.n_placed;
+        self.counts.range_scans_refused += settled.n_refused;
         for camera_ix in 0..self.cameras.len() {
             while let Some(ripe) = self.next_ripe(camera_ix, at_end) {
                 match ripe {
@@ -275,7 +293,12 @@ impl Join {
 impl CameraState {
     fn new(camera: &config::Camera, rig: &Rig, spacing: Spacing) -> anyhow::Result<Self> {
         let named = || format!("camera {:?}", camera.name);
-        if camera.readout_micros.is_none() && camera.parent == Parent::Flange {
+        let is_fixed = match camera.parent {
+            Parent::Flange => false,
+            Parent::Base => rig.base.driver == BaseDriver::Fixed,
+            Parent::World => true,
+        };
+        if camera.readout_micros.is_none() && !is_fixed {
             log::warn!("camera {:?}: readout_micros is not in the rig file; taken for a global shutter", camera.name);
         }
         if camera.stamp_to_mid_exposure.is_none() && camera.driver != CameraDriver::Sim {
@@ -287,7 +310,7 @@ impl CameraState {
             config: camera.clone(),
             color_lens: Lens::new(&camera.intrinsics, rig.train.scale).with_context(named)?,
             depth_lens,
-            acceptance: Acceptance::new(&rig.join, camera, spacing),
+            acceptance: Acceptance::new(&rig.join, camera, is_fixed, spacing),
             waiting: Waiting::new(camera.driver == CameraDriver::Sim && rig.sim.truth),
             n_accepted: 0,
             warned: false,

@@ -79,25 +79,41 @@ impl Motion {
         }
     }
 
+    /// The base at a stamp; `NotYet` when the poses do not reach so far.
+    pub(super) fn world_from_base(&self, stamp: Stamp) -> Result<Transform, HistoryError> {
+        match &self.base {
+            BaseMotion::Fixed(pose) => Ok(*pose),
+            BaseMotion::Told(history) => history.at(stamp),
+        }
+    }
+
     /// A camera at a stamp; `NotYet` when the readings do not reach so far.
     pub(super) fn at(&self, camera: &config::Camera, stamp: Stamp) -> Result<Posed, HistoryError> {
-        let world_from_base = match &self.base {
-            BaseMotion::Fixed(pose) => *pose,
-            BaseMotion::Told(history) if camera.parent != Parent::World => history.at(stamp)?,
-            BaseMotion::Told(_) => Transform::identity(),
+        let (world_from_base, base_twist) = match &self.base {
+            BaseMotion::Fixed(pose) => (*pose, Twist::zero()),
+            BaseMotion::Told(history) if camera.parent != Parent::World => history.with_twist_at(stamp)?,
+            BaseMotion::Told(_) => (Transform::identity(), Twist::zero()),
         };
-        let still =
-            |world_from_camera| Posed { world_from_camera, twist: Some(Twist::zero()), joint_twists: [].into() };
+        let carried =
+            |world_from_camera, twist| Posed { world_from_camera, twist: Some(twist), joint_twists: [].into() };
         match camera.parent {
-            Parent::World => Ok(still(camera.parent_from_camera)),
-            Parent::Base => Ok(still(world_from_base * camera.parent_from_camera)),
+            Parent::World => Ok(carried(camera.parent_from_camera, Twist::zero())),
+            Parent::Base => Ok(carried(
+                world_from_base * camera.parent_from_camera,
+                base_twist.of_attached(&camera.parent_from_camera),
+            )),
             Parent::Flange => {
                 let joints = self.joints.at(stamp)?;
                 // A reading of another length is refused when it is pushed, so the chain cannot fail on these.
                 let Ok(base_from_flange) = self.chain.forward(&joints.position) else {
                     return Err(HistoryError::NotFinite);
                 };
-                let flange_twist = self.chain.tip_twist(&joints.position, &joints.velocity).ok();
+                let by_base = base_twist.of_attached(&base_from_flange);
+                let by_arm = self.chain.tip_twist(&joints.position, &joints.velocity).ok();
+                let flange_twist = by_arm.map(|by_arm| Twist {
+                    linear_m_s: by_arm.linear_m_s + by_base.linear_m_s,
+                    angular_rad_s: by_arm.angular_rad_s + by_base.angular_rad_s,
+                });
                 let by_joint = self.chain.tip_twists_by_joint(&joints.position).unwrap_or_default();
                 Ok(Posed {
                     world_from_camera: world_from_base * base_from_flange * camera.parent_from_camera,

@@ -85,6 +85,10 @@ pub(crate) struct Counts {
     pub(crate) joints_refused: u64,
     /// Base poses that were out of order or not numbers.
     pub(crate) base_poses_refused: u64,
+    /// Turns of range scanners that were put into the world.
+    pub(crate) range_scans: u64,
+    /// Turns without base poses, of unknown scanners, or too many that waited.
+    pub(crate) range_scans_refused: u64,
     /// Images refused, by reason.
     pub(crate) refused: BTreeMap<Refusal, u64>,
     /// Cameras that sent images and are not in the rig file.
@@ -137,6 +141,8 @@ impl std::fmt::Display for Counts {
             (self.device_skipped, "lost by devices"),
             (self.joints_refused, "joint readings refused"),
             (self.base_poses_refused, "base poses refused"),
+            (self.range_scans, "range scans placed"),
+            (self.range_scans_refused, "range scans refused"),
         ];
         for (n, what) in rest {
             if n > 0 {

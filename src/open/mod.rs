@@ -5,7 +5,7 @@ mod simulated;
 #[cfg(all(test, feature = "sim"))]
 mod simulated_tests;
 
-use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Rig};
+use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Rig, ScannerDriver};
 use anyhow::{Context, bail};
 use drivers::recording::{About, RIG_FILE, Recorder, Recording, URDF_FILE};
 use drivers::{Error, Sample, Source};
@@ -35,7 +35,10 @@ pub(crate) struct Opened {
 pub(crate) fn rig(mut rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
     if devices == Devices::Sim {
         rig.arm.driver = ArmDriver::Sim;
-        rig.base.driver = BaseDriver::Fixed;
+        rig.base.driver = if base_moves(&rig.sim.scene) { BaseDriver::Sim } else { BaseDriver::Fixed };
+        for scanner in &mut rig.scanners {
+            scanner.driver = ScannerDriver::Sim;
+        }
         for camera in &mut rig.cameras {
             camera.driver = CameraDriver::Sim;
         }
@@ -99,8 +102,11 @@ fn absent_device(rig: &Rig) -> Option<String> {
     if rig.arm.driver != ArmDriver::Sim {
         return Some(format!("arm driver {:?}", format!("{:?}", rig.arm.driver).to_lowercase()));
     }
-    if rig.base.driver != BaseDriver::Fixed {
+    if !matches!(rig.base.driver, BaseDriver::Fixed | BaseDriver::Sim) {
         return Some(format!("base driver {:?}", format!("{:?}", rig.base.driver).to_lowercase()));
+    }
+    if let Some(scanner) = rig.scanners.iter().find(|scanner| scanner.driver != ScannerDriver::Sim) {
+        return Some(format!("range scanner {:?} with driver {:?}", scanner.name, "udp"));
     }
     let camera = rig.cameras.iter().find(|camera| camera.driver != CameraDriver::Sim)?;
     Some(format!("camera {:?} with driver {:?}", camera.name, format!("{:?}", camera.driver).to_lowercase()))
@@ -109,6 +115,16 @@ fn absent_device(rig: &Rig) -> Option<String> {
 #[cfg(feature = "sim")]
 fn simulate(rig: &Rig) -> anyhow::Result<Box<dyn Source>> {
     simulated::open(rig)
+}
+
+#[cfg(feature = "sim")]
+fn base_moves(scene: &str) -> bool {
+    sim::Scene::from_name(scene).is_some_and(sim::Scene::has_moving_base)
+}
+
+#[cfg(not(feature = "sim"))]
+fn base_moves(_scene: &str) -> bool {
+    false
 }
 
 #[cfg(not(feature = "sim"))]

@@ -1,6 +1,6 @@
 //! A rig's simulated twin: the same cameras and joints in MuJoCo.
 
-use crate::config::{Camera, Parent, Rig};
+use crate::config::{BaseDriver, Camera, Parent, Rig, Scanner};
 use anyhow::bail;
 use drivers::{Error, Live, Sample, Source};
 use kinematics::{Stamp, Transform};
@@ -14,9 +14,9 @@ pub(super) fn open(rig: &Rig) -> anyhow::Result<Box<dyn Source>> {
     }
     // In real time the end is found here: devices that end would look like devices that fail.
     (config.duration_secs, config.n_images) = (None, None);
-    let sim::LiveRig { cameras, arm, truth, .. } = sim::open(&config)?.into_live(Stamp::default())?;
+    let sim::LiveRig { devices, truth, .. } = sim::open(&config)?.into_live(Stamp::default())?;
     Ok(Box::new(RealTime {
-        live: Live::new(cameras, Some(arm))?,
+        live: Live::new(devices)?,
         truth,
         first_camera: Arc::clone(&rig.cameras[0].name),
         n_left: rig.sim.n_images,
@@ -36,7 +36,7 @@ struct RealTime {
 impl Source for RealTime {
     fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
         if let Some(truth) = self.truth.take() {
-            return Ok(Some(Sample::Truth(truth)));
+            return Ok(Some(truth));
         }
         if self.n_left == Some(0) {
             return Ok(None);
@@ -63,6 +63,10 @@ fn config_of(rig: &Rig) -> anyhow::Result<sim::Config> {
     if rig.base.world_from_base != Transform::identity() {
         bail!("a simulated base stands in the world's origin: base.world_from_base has to be the identity");
     }
+    if scene.has_moving_base() != (rig.base.driver == BaseDriver::Sim) {
+        let driver = if scene.has_moving_base() { "sim" } else { "fixed" };
+        bail!("the scene {:?} needs base.driver = {driver:?}", scene.name());
+    }
     Ok(sim::Config {
         scene,
         seed: rig.sim.seed,
@@ -75,25 +79,39 @@ fn config_of(rig: &Rig) -> anyhow::Result<sim::Config> {
         n_images: rig.sim.n_images,
         joint_names: super::chain_of(rig)?.joint_names().to_vec(),
         reading_order: rig.arm.joints.clone(),
-        cameras: rig.cameras.iter().map(camera_of).collect::<Result<_, _>>()?,
+        scanners: rig.scanners.iter().map(scanner_of).collect(),
+        base: sim::BaseConfig { rate_hz: rig.base.rate_hz, drift_m: rig.base.drift_m, drift_rad: rig.base.drift_rad },
+        light_inside_frac: rig.sim.light_inside_frac,
+        cameras: rig.cameras.iter().map(camera_of).collect(),
     })
 }
 
-fn camera_of(camera: &Camera) -> anyhow::Result<sim::CameraConfig> {
-    if let Some(depth) = &camera.depth
-        && (depth.intrinsics != camera.intrinsics || depth.camera_from_depth != Transform::identity())
-    {
-        bail!(
-            "camera {:?}: simulated depth is registered to the colour images: leave its size, lens and pose out",
-            camera.name
-        );
+fn scanner_of(scanner: &Scanner) -> sim::ScannerConfig {
+    sim::ScannerConfig {
+        name: scanner.name.to_string(),
+        rate_hz: scanner.rate_hz,
+        base_from_scanner: scanner.base_from_scanner,
+        n_rings: scanner.sim.rings,
+        elevation_rad: [scanner.sim.lowest_rad, scanner.sim.highest_rad],
+        n_columns: scanner.sim.columns,
+        min_m: scanner.min_m,
+        max_m: scanner.max_m,
+        noise_sigma_m: scanner.sim.noise_sigma_m,
+        dropped_frac: scanner.sim.dropped_frac,
     }
+}
+
+fn camera_of(camera: &Camera) -> sim::CameraConfig {
     let default = sim::SensorConfig::default();
-    Ok(sim::CameraConfig {
+    sim::CameraConfig {
         name: camera.name.to_string(),
         intrinsics: camera.intrinsics.clone(),
         rate_hz: camera.rate_hz,
-        parent: if camera.parent == Parent::Flange { sim::Parent::Flange } else { sim::Parent::World },
+        parent: match camera.parent {
+            Parent::Flange => sim::Parent::Flange,
+            Parent::Base => sim::Parent::Base,
+            Parent::World => sim::Parent::World,
+        },
         parent_from_camera: camera.parent_from_camera,
         sensor: sim::SensorConfig {
             noise_sigma: camera.sim.noise_sigma,
@@ -106,11 +124,17 @@ fn camera_of(camera: &Camera) -> anyhow::Result<sim::CameraConfig> {
             supersample: camera.sim.supersample,
         },
         depth: camera.depth.as_ref().map(|depth| sim::DepthConfig {
+            sensor: (depth.intrinsics != camera.intrinsics || depth.camera_from_depth != Transform::identity()).then(
+                || sim::DepthSensor {
+                    intrinsics: depth.intrinsics.clone(),
+                    camera_from_depth: depth.camera_from_depth,
+                },
+            ),
             noise_sigma_m: camera.sim.depth_noise_sigma_m,
             hole_frac: camera.sim.depth_hole_frac,
             min_m: depth.min_m,
             max_m: depth.max_m,
             metres_per_count: camera.sim.metres_per_count,
         }),
-    })
+    }
 }

@@ -124,3 +124,70 @@ fn a_rig_in_real_time_ends_when_its_time_is_over() {
     assert!((2..=24).contains(&n_images), "{n_images} images");
     assert_eq!(join.counts().images, n_images);
 }
+
+/// Turns of scanners as text with every bit in it.
+fn range_bits(join: &Join) -> Vec<String> {
+    join.range_scans().map(|scan| format!("{scan:?}")).collect()
+}
+
+fn mobile(name: &str, overrides: &[Override]) -> Rig {
+    let mut all = vec![Override::new("sim.lockstep", true), Override::new("train.scale", 0.25)];
+    all.extend(overrides.iter().cloned());
+    Rig::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs").join(name), &all)
+        .expect("a rig file that comes along")
+}
+
+#[test]
+fn keyframes_and_scans_of_moving_bases_are_the_same_bits_live_recorded_and_replayed() {
+    for (name, secs) in [("mobile-base-small.toml", 4.0), ("mobile-arm.toml", 3.0)] {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("run.mcap");
+        let rig = mobile(name, &[Override::new("sim.duration_secs", secs)]);
+        let live = super::rig(rig.clone(), Devices::Sim).expect("the simulator");
+        let mut recorder = super::recorder(&path, &live.rig).expect("a new file");
+        let mut samples = Vec::new();
+        let (first, join) = keyframes(live, |sample| {
+            recorder.write(sample).expect("room on the disk");
+            samples.push(format!("{sample:?}"));
+        });
+        recorder.finish().expect("room on the disk");
+        assert!(first.len() >= 3, "{name}: {}", join.counts());
+        let n_scans = join.range_scans().count();
+        assert!((n_scans >= 30) == (name == "mobile-base-small.toml"), "{name}: {n_scans} scans, {}", join.counts());
+        let (again, join_again) = keyframes(super::rig(rig, Devices::Sim).expect("the simulator"), |_| {});
+        assert!(
+            bits(&first) == bits(&again) && range_bits(&join) == range_bits(&join_again),
+            "{name}: two runs differ"
+        );
+        let mut replayed = samples.iter();
+        let opened = super::recording(&path, None, &[]).expect("a recording");
+        let (replay, join_replay) = keyframes(opened, |sample| {
+            assert!(replayed.next() == Some(&format!("{sample:?}")), "{name}: a sample differs");
+        });
+        assert!(replayed.next().is_none() && bits(&first) == bits(&replay), "{name}: the replay differs");
+        assert!(range_bits(&join) == range_bits(&join_replay), "{name}: the scans of the replay differ");
+    }
+}
+
+#[test]
+fn poses_velocities_and_scans_of_moving_bases_agree_with_the_simulator() {
+    const CLOSE: f64 = 1e-4; // Metres and radians: joints every 1 ms and base poses every 10 ms, interpolated.
+    for (name, secs) in [("mobile-base-small.toml", 6.0), ("mobile-arm.toml", 6.0)] {
+        let rig = mobile(name, &[Override::new("sim.duration_secs", secs), Override::new("sim.ideal", true)]);
+        let (keyframes, join) = keyframes(super::rig(rig, Devices::Sim).expect("the simulator"), |_| {});
+        assert!(keyframes.len() > 4, "{name}: {}", join.counts());
+        for keyframe in &keyframes {
+            let truth = keyframe.truth.as_ref().expect("ground truth comes beside the images");
+            let apart = truth.world_from_camera.inverse() * keyframe.world_from_camera;
+            assert!(apart.translation.vector.norm() < CLOSE && apart.rotation.angle() < CLOSE, "{name}: {apart}");
+            let twist = keyframe.twist.expect("poses come all the time");
+            let is_moving = twist.linear_m_s.norm() + twist.angular_rad_s.norm() > 1e-3;
+            assert!(is_moving || keyframe.stamp.0 < 1_000_000_000, "{name}: {twist:?} at {:?}", keyframe.stamp);
+        }
+        for scan in join.range_scans() {
+            // Without noise no echo lies outside the room of 15 x 10 x 3 m by more than poses and f32 allow.
+            let inside = |[x, y, z]: [f32; 3]| x.abs() < 7.502 && y.abs() < 5.002 && z > -0.002 && z < 3.002;
+            assert!(scan.points_in_world_m.len() > 4000 && scan.points_in_world_m.iter().all(|point| inside(*point)));
+        }
+    }
+}

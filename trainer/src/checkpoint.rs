@@ -92,6 +92,9 @@ impl Checkpoint {
                 _ => File::open(".")?.sync_all(),
             }
         });
+        if written.is_err() {
+            let _ = std::fs::remove_file(&partial); // What it holds is of no use, and the model may need its room.
+        }
         written.map_err(|source| Error::Write { path: path.to_owned(), source })
     }
 

@@ -20,7 +20,8 @@ const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
 /// Reads a folder, or the file itself.
 ///
 /// Frames come in file-name order. Images that are not there, are no images, or were taken further away than any robot
-/// goes, are left out and counted; a pose that is not finite or not rigid, or a camera model we lack, is an error that names the frame.
+/// goes, are left out and counted; and so are those whose
+/// pose is not finite or not rigid; a camera model we lack is an error that names the frame.
 pub fn read(path: &Path) -> Result<Dataset, Error> {
     let file = if path.is_file() { path.to_owned() } else { path.join(FILE_NAME) };
     let folder = file.parent().unwrap_or(Path::new(".")).to_owned();
@@ -39,9 +40,8 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
     let (mut frames, mut left_out, mut notes) = (Vec::new(), LeftOut::default(), Vec::new());
     for (ix, entry) in document.frames.iter().enumerate() {
         let in_frame = |reason: String| wrong(format!("frame {:?}: {reason}", entry.file_path));
-        let world_from_camera = world_from_camera(&entry.transform_matrix).map_err(in_frame)?;
-        let depth_pose =
-            entry.depth_transform_matrix.as_ref().map(self::world_from_camera).transpose().map_err(in_frame)?;
+        let rows = rows_of(&entry.transform_matrix).map_err(in_frame)?;
+        let depth_rows = entry.depth_transform_matrix.as_ref().map(rows_of).transpose().map_err(in_frame)?;
         let Some(image_path) = existing(&folder, &entry.file_path) else {
             left_out.missing.push(entry.file_path.clone());
             continue;
@@ -50,6 +50,15 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
             Ok(size_px) => size_px,
             Err(error) => {
                 left_out.broken.push((entry.file_path.clone(), reason_of(&error)));
+                continue;
+            }
+        };
+        let poses = world_from_camera(&rows)
+            .and_then(|pose| Ok((pose, depth_rows.map(|rows| self::world_from_camera(&rows)).transpose()?)));
+        let (world_from_camera, depth_pose) = match poses {
+            Ok(poses) => poses,
+            Err(reason) => {
+                left_out.broken.push((entry.file_path.clone(), reason));
                 continue;
             }
         };
@@ -137,16 +146,18 @@ impl Entry {
     }
 }
 
-/// A pose of theirs as one of ours.
-fn world_from_camera(matrix: &Matrix) -> Result<Transform, String> {
+fn rows_of(matrix: &Matrix) -> Result<[f64; 16], String> {
     let mut rows: Vec<f64> = matrix.iter().flatten().map(|value| value.unwrap_or(f64::NAN)).collect();
     if rows.len() == 12 {
         rows.extend([0.0, 0.0, 0.0, 1.0]);
     }
-    let rows: [f64; 16] = rows
-        .try_into()
-        .map_err(|rows: Vec<f64>| format!("transform_matrix has {} numbers, must be 4 rows of 4", rows.len()))?;
-    let world_from_opengl = transform::from_rows(&rows).map_err(|error| error.to_string())?;
+    rows.try_into()
+        .map_err(|rows: Vec<f64>| format!("transform_matrix has {} numbers, must be 4 rows of 4", rows.len()))
+}
+
+/// A pose of theirs as one of ours.
+fn world_from_camera(rows: &[f64; 16]) -> Result<Transform, String> {
+    let world_from_opengl = transform::from_rows(rows).map_err(|error| error.to_string())?;
     Ok(world_from_opengl * opengl_from_camera())
 }
 

@@ -201,7 +201,7 @@ fn depth_that_does_not_decode_costs_the_depth_only() {
 }
 
 #[test]
-fn a_bad_pose_or_camera_names_the_frame() {
+fn a_bad_camera_names_the_frame() {
     let (folder, document) = small_folder();
     write_transforms(&folder, &document);
     let good = document.to_string();
@@ -210,11 +210,6 @@ fn a_bad_pose_or_camera_names_the_frame() {
         std::fs::write(folder.path().join("transforms.json"), good.replacen(from, to, 1)).unwrap();
         complaint(&folder)
     };
-    // As Python writes it, which is no JSON.
-    let text = with("[1.0,0.0,0.0,0.0]", "[1.0,0.0,0.0,NaN]");
-    assert!(text.contains("frame \"b.png\": ") && text.contains("not a finite number"), "{text}");
-    assert!(with("[1.0,0.0,0.0,0.0]", "[1.0,-Infinity,0.0,0.0]").contains("frame \"b.png\""));
-    assert!(with("[1.0,0.0,0.0,0.0]", "[2.0,0.0,0.0,0.0]").contains("not rigid"));
     assert!(with("[1.0,0.0,0.0,0.0]", "[1.0,0.0,0.0]").contains("has 15 numbers"));
     assert!(with("\"aabb_scale\":16", "\"camera_model\":\"EQUIRECTANGULAR\"").contains("EQUIRECTANGULAR"));
     assert!(with("\"aabb_scale\":16", "\"k4\":0.1").contains("k4 is 0.1"));
@@ -224,6 +219,25 @@ fn a_bad_pose_or_camera_names_the_frame() {
     assert!(with("\"frames\"", "\"frame\"").contains("missing field `frames`"));
     assert!(with("{", "").contains("neither a recording (.mcap) nor a dataset folder nor a transforms.json"));
     assert!(with("}", "").contains("transforms.json"));
+}
+
+#[test]
+fn an_image_with_a_bad_pose_is_left_out_and_told() {
+    let (folder, document) = small_folder();
+    // As Python writes it, which is no JSON.
+    for (row, reason) in [
+        ("[1.0,0.0,0.0,NaN]", "not a finite number"),
+        ("[1.0,-Infinity,0.0,0.0]", "not a finite number"),
+        ("[2.0,0.0,0.0,0.0]", "not rigid"),
+        ("[-1.0,0.0,0.0,0.0]", "not rigid"),
+    ] {
+        let spoiled = document.to_string().replacen("[1.0,0.0,0.0,0.0]", row, 1);
+        std::fs::write(folder.path().join("transforms.json"), spoiled).unwrap();
+        let dataset = read(folder.path()).unwrap();
+        let [told] = &dataset.losses[..] else { panic!("{:?}", dataset.losses) };
+        assert!(told.contains("b.png (") && told.contains(reason), "{told}");
+        assert_eq!((dataset.frames.len(), dataset.n_unusable), (1, 1));
+    }
 }
 
 #[test]
@@ -304,5 +318,7 @@ fn broken_tum_lists_name_the_line() {
     assert!(complaint(&folder).contains("nothing follows the time"));
     std::fs::write(folder.path().join("rgb.txt"), "1.0 rgb/1.000000.png\n").unwrap();
     std::fs::write(folder.path().join("groundtruth.txt"), "1.0 nan 0 0 0 0 0 1\n").unwrap();
-    assert!(complaint(&folder).contains("pose at 1.0000 s: not finite"));
+    assert!(complaint(&folder).contains("no pose within 20 ms"), "a pose that is none does not count");
+    std::fs::write(folder.path().join("groundtruth.txt"), "0.99 0 0 0 0 0 0 0\n1.0 0 0 0 0 0 0 1\n").unwrap();
+    assert_eq!(read(folder.path()).unwrap().frames.len(), 1);
 }

@@ -156,20 +156,22 @@ struct Poses(Vec<(Stamp, Transform)>);
 impl Poses {
     fn read(folder: &Path) -> Result<Self, Error> {
         let path = folder.join(POSE_LIST);
-        let poses = stamped_lines(folder, POSE_LIST)?.into_iter().map(|(stamp, words)| {
+        let poses = stamped_lines(folder, POSE_LIST)?.into_iter().filter_map(|(stamp, words)| {
             let wrong = |what: &str| Error::DatasetFile {
                 path: path.clone(),
                 reason: format!("pose at {:.4} s: {what}", stamp.0 as f64 * 1e-9),
             };
             let numbers: Vec<f64> = words.iter().filter_map(|word| word.parse().ok()).collect();
             let [x, y, z, qx, qy, qz, qw] = numbers[..] else {
-                return Err(wrong("expected tx ty tz qx qy qz qw"));
+                return Some(Err(wrong("expected tx ty tz qx qy qz qw")));
             };
             let rotation = Quaternion::new(qw, qx, qy, qz);
             if !numbers.iter().all(|number| number.is_finite()) || (rotation.norm() - 1.0).abs() > 0.01 {
-                return Err(wrong("not finite, or its quaternion is not of length 1"));
+                log::warn!("{}", wrong("left out: not finite, or its quaternion is not of length 1"));
+                return None;
             }
-            Ok((stamp, Transform::from_parts(Vector3::new(x, y, z).into(), UnitQuaternion::new_normalize(rotation))))
+            let rotation = UnitQuaternion::new_normalize(rotation);
+            Some(Ok((stamp, Transform::from_parts(Vector3::new(x, y, z).into(), rotation))))
         });
         Ok(Self(poses.collect::<Result<_, _>>()?))
     }

@@ -4,7 +4,7 @@
 //! before the cut.
 
 use super::topic::{JOINT_NAMES, Topic};
-use crate::wire::{Malformed, foxglove, joint_state};
+use crate::wire::{Malformed, foxglove, joint_state, point_cloud};
 use crate::{BasePose, Error, Image, Sample, Source, TruthImage};
 use mcap::McapError;
 use mcap::records::Record;
@@ -180,6 +180,11 @@ impl Recording {
                 let (stamp, world_from_base) = foxglove::decode_transform(data)?;
                 Sample::Base(BasePose { stamp, world_from_base })
             }
+            Topic::TrueBase => {
+                let (stamp, world_from_base) = foxglove::decode_transform(data)?;
+                Sample::BaseTruth(BasePose { stamp, world_from_base })
+            }
+            Topic::Range(_) => Sample::Range(point_cloud::decode(data)?),
             Topic::Calibration(_) => return Ok(None),
             Topic::TrueColor(_) => {
                 self.true_color = Some(image()?);

@@ -24,6 +24,10 @@ pub(super) enum Topic {
     Joints,
     /// Poses of the base.
     Base,
+    /// True poses of a simulated base.
+    TrueBase,
+    /// Turns of a range scanner.
+    Range(String),
 }
 
 impl Topic {
@@ -38,6 +42,8 @@ impl Topic {
             Self::TruePose(camera) => format!("/camera/{camera}/truth/pose"),
             Self::Joints => "/joints".into(),
             Self::Base => "/base".into(),
+            Self::TrueBase => "/base/truth".into(),
+            Self::Range(scanner) => format!("/range/{scanner}/points"),
         }
     }
 
@@ -46,7 +52,11 @@ impl Topic {
         match name {
             "/joints" => return Some(Self::Joints),
             "/base" => return Some(Self::Base),
+            "/base/truth" => return Some(Self::TrueBase),
             _ => {}
+        }
+        if let Some(scanner) = name.strip_prefix("/range/").and_then(|rest| rest.strip_suffix("/points")) {
+            return Some(Self::Range(scanner.to_owned()));
         }
         let (camera, kind) = name.strip_prefix("/camera/")?.split_once('/')?;
         let camera = camera.to_owned();
@@ -109,10 +119,12 @@ mod tests {
             Topic::TruePose(camera()),
             Topic::Joints,
             Topic::Base,
+            Topic::TrueBase,
+            Topic::Range("lidar".to_owned()),
         ] {
             assert_eq!(Topic::from_name(&topic.name()), Some(topic));
         }
-        for strange in ["/camera/wrist", "/camera/wrist/infrared", "/tf", ""] {
+        for strange in ["/camera/wrist", "/camera/wrist/infrared", "/range/lidar", "/tf", ""] {
             assert_eq!(Topic::from_name(strange), None, "{strange}");
         }
     }

@@ -3,7 +3,7 @@
 //! Chunks are closed at least once a second of sample time, so whatever stops the program costs at most that second.
 
 use super::topic::{Encoding, JOINT_NAMES, Topic};
-use crate::wire::{descriptor, foxglove, joint_state};
+use crate::wire::{descriptor, foxglove, joint_state, point_cloud};
 use crate::{Error, Image, Kept, PixelFormat, Sample, TruthImage};
 use kinematics::{Intrinsics, Stamp};
 use mcap::McapError;
@@ -161,6 +161,14 @@ impl Recorder {
             Sample::Base(pose) => {
                 let message = foxglove::encode_transform("world", "base", stamp, &pose.world_from_base);
                 self.put(Topic::Base, descriptor::FRAME_TRANSFORM, stamp, &message)?;
+            }
+            Sample::BaseTruth(pose) => {
+                let message = foxglove::encode_transform("world", "base_truth", stamp, &pose.world_from_base);
+                self.put(Topic::TrueBase, descriptor::FRAME_TRANSFORM, stamp, &message)?;
+            }
+            Sample::Range(scan) => {
+                let message = point_cloud::encode(scan);
+                self.put(Topic::Range(scan.scanner.to_string()), descriptor::POINT_CLOUD, stamp, &message)?;
             }
             Sample::Truth(truth) => self.put_truth(truth)?,
         }

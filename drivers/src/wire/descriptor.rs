@@ -12,6 +12,14 @@ pub struct Schema {
     pub name: &'static str,
     fields: &'static [FieldSpec],
     needs: &'static [&'static Self],
+    enums: &'static [EnumSpec],
+}
+
+/// Names of an enum declared in a message, by number from zero.
+#[derive(Clone, Copy, Debug)]
+struct EnumSpec {
+    name: &'static str,
+    values: &'static [&'static str],
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -32,6 +40,8 @@ enum Kind {
     Text,
     Bytes,
     Message(&'static str),
+    Messages(&'static str),
+    Enum(&'static str),
 }
 
 const fn field(name: &'static str, number: u32, kind: Kind) -> FieldSpec {
@@ -42,12 +52,14 @@ const TIMESTAMP: Schema = Schema {
     name: "google.protobuf.Timestamp",
     fields: &[field("seconds", 1, Kind::Int64), field("nanos", 2, Kind::Int32)],
     needs: &[],
+    enums: &[],
 };
 
 const VECTOR3: Schema = Schema {
     name: "foxglove.Vector3",
     fields: &[field("x", 1, Kind::Double), field("y", 2, Kind::Double), field("z", 3, Kind::Double)],
     needs: &[],
+    enums: &[],
 };
 
 const QUATERNION: Schema = Schema {
@@ -59,6 +71,7 @@ const QUATERNION: Schema = Schema {
         field("w", 4, Kind::Double),
     ],
     needs: &[],
+    enums: &[],
 };
 
 /// A compressed colour image.
@@ -75,6 +88,7 @@ pub const COMPRESSED_IMAGE: Schema = Schema {
         field("height_px", 1004, Kind::Fixed32),
     ],
     needs: &[&TIMESTAMP],
+    enums: &[],
 };
 
 /// An uncompressed colour or depth image.
@@ -93,6 +107,7 @@ pub const RAW_IMAGE: Schema = Schema {
         field("metres_per_count", 1005, Kind::Double),
     ],
     needs: &[&TIMESTAMP],
+    enums: &[],
 };
 
 /// Lens parameters of a camera.
@@ -110,6 +125,7 @@ pub const CAMERA_CALIBRATION: Schema = Schema {
         field("frame_id", 9, Kind::Text),
     ],
     needs: &[&TIMESTAMP],
+    enums: &[],
 };
 
 /// Pose of one frame in another.
@@ -124,6 +140,46 @@ pub const FRAME_TRANSFORM: Schema = Schema {
         field("psnr_ceiling", 1006, Kind::Double),
     ],
     needs: &[&TIMESTAMP, &VECTOR3, &QUATERNION],
+    enums: &[],
+};
+
+const POSE: Schema = Schema {
+    name: "foxglove.Pose",
+    fields: &[
+        field("position", 1, Kind::Message(".foxglove.Vector3")),
+        field("orientation", 2, Kind::Message(".foxglove.Quaternion")),
+    ],
+    needs: &[&VECTOR3, &QUATERNION],
+    enums: &[],
+};
+
+const PACKED_ELEMENT_FIELD: Schema = Schema {
+    name: "foxglove.PackedElementField",
+    fields: &[
+        field("name", 1, Kind::Text),
+        field("offset", 2, Kind::Fixed32),
+        field("type", 3, Kind::Enum(".foxglove.PackedElementField.NumericType")),
+    ],
+    needs: &[],
+    enums: &[EnumSpec {
+        name: "NumericType",
+        values: &["UNKNOWN", "UINT8", "INT8", "UINT16", "INT16", "UINT32", "INT32", "FLOAT32", "FLOAT64"],
+    }],
+};
+
+/// Points of a range scanner.
+pub const POINT_CLOUD: Schema = Schema {
+    name: "foxglove.PointCloud",
+    fields: &[
+        field("timestamp", 1, Kind::Message(".google.protobuf.Timestamp")),
+        field("frame_id", 2, Kind::Text),
+        field("pose", 3, Kind::Message(".foxglove.Pose")),
+        field("point_stride", 4, Kind::Fixed32),
+        field("fields", 5, Kind::Messages(".foxglove.PackedElementField")),
+        field("data", 6, Kind::Bytes),
+    ],
+    needs: &[&TIMESTAMP, &VECTOR3, &QUATERNION, &POSE, &PACKED_ELEMENT_FIELD],
+    enums: &[],
 };
 
 impl Schema {
@@ -145,6 +201,9 @@ impl Schema {
         for field in self.fields {
             message.message(2, &field.encode());
         }
+        for listed in self.enums {
+            message.message(4, &listed.encode());
+        }
         let mut file = Message::default();
         file.bytes(1, self.path().as_bytes()).bytes(2, package.as_bytes());
         for needed in self.needs {
@@ -164,6 +223,20 @@ impl Schema {
     }
 }
 
+impl EnumSpec {
+    /// The enum as an `EnumDescriptorProto`.
+    fn encode(&self) -> Message {
+        let mut encoded = Message::default();
+        encoded.bytes(1, self.name.as_bytes());
+        for (number, name) in (0..).zip(self.values) {
+            let mut value = Message::default();
+            value.bytes(1, name.as_bytes()).varint(2, number);
+            encoded.message(2, &value);
+        }
+        encoded
+    }
+}
+
 impl FieldSpec {
     /// The field as a `FieldDescriptorProto`.
     fn encode(&self) -> Message {
@@ -178,6 +251,8 @@ impl FieldSpec {
             Kind::Fixed32 => (OPTIONAL, 7, None),
             Kind::Text => (OPTIONAL, 9, None),
             Kind::Message(name) => (OPTIONAL, 11, Some(name)),
+            Kind::Messages(name) => (REPEATED, 11, Some(name)),
+            Kind::Enum(name) => (OPTIONAL, 14, Some(name)),
             Kind::Bytes => (OPTIONAL, 12, None),
         };
         let mut encoded = Message::default();
@@ -221,8 +296,18 @@ mod tests {
 
     #[test]
     fn field_numbers_are_unique() {
-        for schema in [TIMESTAMP, VECTOR3, QUATERNION, COMPRESSED_IMAGE, RAW_IMAGE, CAMERA_CALIBRATION, FRAME_TRANSFORM]
-        {
+        for schema in [
+            TIMESTAMP,
+            VECTOR3,
+            QUATERNION,
+            POSE,
+            PACKED_ELEMENT_FIELD,
+            COMPRESSED_IMAGE,
+            RAW_IMAGE,
+            CAMERA_CALIBRATION,
+            FRAME_TRANSFORM,
+            POINT_CLOUD,
+        ] {
             let mut numbers: Vec<_> = schema.fields.iter().map(|field| field.number).collect();
             numbers.sort_unstable();
             numbers.dedup();

@@ -221,14 +221,14 @@ fn numbers<const N: usize>(field: &Field<'_>) -> Result<[f64; N], Malformed> {
     Ok(numbers)
 }
 
-fn timestamp(stamp: Stamp) -> Message {
+pub(super) fn timestamp(stamp: Stamp) -> Message {
     let mut message = Message::default();
     message.varint(1, stamp.0.div_euclid(NANOS_PER_SEC).cast_unsigned());
     message.varint(2, stamp.0.rem_euclid(NANOS_PER_SEC).cast_unsigned());
     message
 }
 
-fn stamp_from(field: &Field<'_>) -> Result<Stamp, Malformed> {
+pub(super) fn stamp_from(field: &Field<'_>) -> Result<Stamp, Malformed> {
     let mut secs = 0_i64;
     let mut nanos = 0_i64;
     for inner in fields(field.bytes()?) {

@@ -3,6 +3,7 @@
 pub mod descriptor;
 pub mod foxglove;
 pub mod joint_state;
+pub mod point_cloud;
 pub mod protobuf;
 
 /// Bytes that do not follow their format.

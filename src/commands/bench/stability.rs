@@ -130,7 +130,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let data = runs.load(&args.data, &mut HashSet::new())?;
     let plans = args.plans(&data)?;
     let n_levels: usize = plans.iter().map(|plan| plan.levels.len()).sum();
-    runs.expect(n_levels * VARIANTS.len() * usize::try_from(args.seeds)?);
+    let variants = told_apart(&data.options);
+    runs.expect(n_levels * variants.len() * usize::try_from(args.seeds)?);
     let mut envelopes: Vec<Envelope> = Vec::new();
     let mut page = None;
     for plan in &plans {
@@ -140,7 +141,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             variants: Vec::new(),
             what: plan.what,
         });
-        for variant in VARIANTS {
+        for &variant in &variants {
             let mut curve = Curve { name: variant.name, points: Vec::new(), breaks: Vec::new() };
             for level in &plan.levels {
                 let finished = measure(args, &mut runs, &data, limits, plan, variant, *level)?;
@@ -157,6 +158,21 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         findings.tell(&page, args.bench.json)?;
     }
     Ok(exit::after(&data.data.losses))
+}
+
+/// The ways to train that differ for these data: where nothing is looked for about cameras there is one.
+fn told_apart(options: &SplatOptions) -> Vec<&'static Variant> {
+    let mut told_apart: Vec<&Variant> = Vec::new();
+    for variant in VARIANTS {
+        let changed = (variant.change)(options.clone());
+        if told_apart.iter().all(|other| (other.change)(options.clone()) != changed) {
+            told_apart.push(variant);
+        }
+    }
+    if told_apart.len() < VARIANTS.len() {
+        log::warn!("nothing is looked for about cameras here: see --refine; only one way to train is measured");
+    }
+    told_apart
 }
 
 /// The runs of one size.

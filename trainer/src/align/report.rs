@@ -2,7 +2,7 @@
 
 use super::layout::Term;
 use super::solve::Solved;
-use super::{Model, Scene};
+use super::{LEAST_JUDGES, Model, Scene};
 use crate::splat::{CameraFix, Candidate, Trial};
 use nalgebra::{DVector, Vector3};
 use serde::{Deserialize, Serialize};
@@ -236,6 +236,11 @@ impl Alignment {
         !self.fixes.is_empty()
     }
 
+    /// Whether there were enough images to tell what pays.
+    pub fn is_judged(&self) -> bool {
+        self.trials.iter().all(|trial| trial.n_images >= LEAST_JUDGES)
+    }
+
     /// Whether images got poses of their own.
     pub fn has_image_poses(&self) -> bool {
         let of_images = |terms: &Candidate| matches!(terms, Candidate::Cameras(terms) if terms.image_poses);
@@ -253,7 +258,11 @@ impl Alignment {
                 trial.gain_db,
                 trial.standard_error_db,
                 trial.n_images,
-                if trial.kept { "kept" } else { "not needed" }
+                match trial.kept {
+                    true => "kept",
+                    false if trial.n_images < LEAST_JUDGES => "too few to judge by",
+                    false => "not needed",
+                }
             ));
         }
         lines

@@ -25,16 +25,15 @@
 
 override SSIM: bool = true;
 override DEPTH: bool = true;
-var<workgroup> wg_slopes: array<vec4f, 676>;
-var<workgroup> wg_rows: array<vec4f, 416>;
 var<workgroup> wg_gains: array<vec4f, 256>;
+
+#import ssim_upstream
 
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let tile = folded(wg, n_wgs);
     let in_grid = tile < view.n_tiles.x * view.n_tiles.y;
     let corner = vec2i(vec2u(tile % view.n_tiles.x, tile / view.n_tiles.x) * TILE_PX);
-    let size = vec2i(view.size_px);
     let n_pixels = view.size_px.x * view.size_px.y;
     let pixel = vec2u(corner) + vec2u(lane % TILE_PX, lane / TILE_PX);
     let on_image = in_grid && pixel.x < view.size_px.x && pixel.y < view.size_px.y;
@@ -48,30 +47,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let per_value = 1.0 / (3.0 * f32(n_pixels));
     var v_color = (1.0 - supervision.dssim_frac) * per_value * sign(picture - wanted);
     if SSIM {
-        let gaussian = GAUSSIAN;
-        for (var channel = 0u; channel < 3u; channel++) {
-            let plane = channel * 3u * n_pixels;
-            for (var i = lane; i < SPAN * SPAN; i += 256u) {
-                let near = corner + vec2i(vec2u(i % SPAN, i / SPAN)) - i32(HALO);
-                var slope = vec4f(0.0);
-                if all(near >= vec2i(0)) && all(near < size) {
-                    let source = plane + u32(near.y * size.x + near.x);
-                    slope = vec4f(slopes[source], slopes[source + n_pixels], slopes[source + 2u * n_pixels], 0.0);
-                }
-                wg_slopes[i] = slope;
-            }
-            workgroupBarrier(); // The window's slopes are there.
-            for (var i = lane; i < SPAN * TILE_PX; i += 256u) {
-                let from_ = (i / TILE_PX) * SPAN + i % TILE_PX;
-                var sum = vec4f(0.0);
-                for (var k = 0u; k < WINDOW; k++) { sum += gaussian[k] * wg_slopes[from_ + k]; }
-                wg_rows[i] = sum;
-            }
-            workgroupBarrier(); // The rows are there; the next channel writes them only after its own first barrier.
-            var sum = vec4f(0.0);
-            for (var k = 0u; k < WINDOW; k++) { sum += gaussian[k] * wg_rows[lane + k * TILE_PX]; }
-            v_color[channel] -= supervision.dssim_frac * per_value * (sum.x + 2.0 * picture[channel] * sum.y + wanted[channel] * sum.z);
-        }
+        v_color -= supervision.dssim_frac * per_value * ssim_upstream(lane, corner, at, picture, wanted);
     }
     var error = 0.0;
     if seen { error = dot(abs(picture - wanted), vec3f(1.0 / 3.0)); } else { v_color = vec3f(0.0); }

@@ -6,17 +6,9 @@
 // twin      loss/reference.rs
 // source    Wang et al. 2004; gaussian 11, sigma 1.5, zeros outside; one pass over shared memory as in Mallick et al. 2024
 
-#import view
-#import supervision
-#import status
+#import ssim_bindings
 
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<uniform> supervision: Supervision;
-@group(0) @binding(2) var<storage, read> status: array<u32>;
-@group(0) @binding(3) var<storage, read> image: array<vec4f>;
-@group(0) @binding(4) var<storage, read> target_image: array<u32>;
-@group(0) @binding(5) var<storage, read_write> slopes: array<f32>;
-@group(0) @binding(6) var<storage, read> gains: vec4f;
+alias Value = f32;         // a pixel a lane
 
 var<workgroup> wg_pair: array<vec2f, 676>;        // picture, keyframe
 var<workgroup> wg_means: array<vec4f, 416>;       // along rows: x, y, x x, y y
@@ -66,21 +58,11 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
                 m += gaussian[k] * wg_means[lane + k * TILE_PX];
                 product += gaussian[k] * wg_products[lane + k * TILE_PX];
             }
-            const C1 = 0.0001;
-            const C2 = 0.0009;
-            let variances = m.zw - m.xy * m.xy;
-            let a1 = 2.0 * m.x * m.y + C1;
-            let a2 = 2.0 * (product - m.x * m.y) + C2;
-            let b1 = m.x * m.x + m.y * m.y + C1;
-            let b2 = variances.x + variances.y + C2;
-            let similarity = a1 * a2 / (b1 * b2);
-            let of_product = 2.0 * a1 / (b1 * b2);
-            let of_square = -similarity / b2;
-            let of_mean = 2.0 * m.y * a2 / (b1 * b2) - similarity * 2.0 * m.x / b1 - of_product * m.y - 2.0 * of_square * m.x;
+            let found = similarity_slopes(m.x, m.y, m.z, m.w, product);
             let at = channel * 3u * n_pixels + pixel.y * view.size_px.x + pixel.x;
-            slopes[at] = of_mean;
-            slopes[at + n_pixels] = of_square;
-            slopes[at + 2u * n_pixels] = of_product;
+            slopes[at] = found.of_mean;
+            slopes[at + n_pixels] = found.of_square;
+            slopes[at + 2u * n_pixels] = found.of_product;
         }
     }
 }

@@ -41,6 +41,18 @@ const SHARED: &[Source] = &[
     source!("block_bins"),
     source!("camera_terms"),
     source!("camera_sums", "camera_sums_none"),
+    source!("ssim_bindings"),
+    source!("ssim_upstream", "ssim_upstream_window"),
+];
+/// What the kernels of the loss import where windows of pixels stay in the lanes.
+const LOSS_STRIPS: &[Source] = &[
+    VIEW,
+    STATUS,
+    source!("random"),
+    source!("supervision"),
+    source!("ssim_bindings"),
+    source!("ssim_upstream", "ssim_upstream_given"),
+    source!("rows_and_columns"),
 ];
 /// What `update` imports.
 macro_rules! update_sources {
@@ -126,6 +138,7 @@ struct Blend {
     backward: Kernel,
     /// Lanes of a subgroup, where `backward` must know.
     subgroup: Option<u32>,
+    in_strips: bool,
 }
 
 fn blend(gpu: &Gpu) -> Blend {
@@ -135,16 +148,19 @@ fn blend(gpu: &Gpu) -> Blend {
             rasterize: kernel!("rasterize_strips", BLEND_STRIPS),
             backward: kernel!("backward_strips", BLEND_STRIPS),
             subgroup: None,
+            in_strips: true,
         },
         Some(lanes) if (16..=128).contains(&lanes) => Blend {
             rasterize: kernel!("rasterize", BLEND),
             backward: kernel!("backward", BLEND),
             subgroup: Some(lanes),
+            in_strips: false,
         },
         _ => Blend {
             rasterize: kernel!("rasterize", BLEND),
             backward: kernel!("backward", BLEND_BY_MEMORY),
             subgroup: None,
+            in_strips: false,
         },
     }
 }
@@ -162,7 +178,10 @@ pub const KERNELS: &[Kernel] = &[
     kernel!("rasterize_strips", BLEND_STRIPS),
     kernel!("finish"),
     kernel!("loss", "ssim", SHARED),
+    kernel!("loss", "ssim_strips", LOSS_STRIPS),
+    kernel!("loss", "ssim_upstream_strips", LOSS_STRIPS),
     kernel!("loss", "loss_backward", SHARED),
+    kernel!("loss", "loss_backward", LOSS_STRIPS),
     kernel!("backward", BLEND),
     kernel!("backward", BLEND_BY_MEMORY),
     kernel!("backward_strips", BLEND_STRIPS),
@@ -215,10 +234,24 @@ impl DrawPipelines {
     }
 }
 
+/// The structural similarity in the form that suits the adapter.
+#[derive(Debug)]
+pub(crate) enum Ssim {
+    /// One kernel; `loss` gathers its slopes.
+    Tiles(Pipeline),
+    /// Of a few lanes, for software adapters.
+    Strips {
+        /// The slopes towards the means over windows.
+        means: Pipeline,
+        /// From there to the pixels, for `loss`.
+        upstream: Pipeline,
+    },
+}
+
 /// What learning needs on top.
 #[derive(Debug)]
 pub(crate) struct LearnPipelines {
-    pub(crate) ssim: Pipeline,
+    pub(crate) ssim: Ssim,
     pub(crate) loss: Pipeline,
     pub(crate) loss_without_ssim: Pipeline,
     pub(crate) backward: Pipeline,
@@ -240,10 +273,20 @@ impl LearnPipelines {
     pub(crate) fn new(gpu: &Gpu) -> Result<Self, Error> {
         let blend = blend(gpu);
         let lanes: Vec<_> = blend.subgroup.map(|lanes| ("SUBGROUP", f64::from(lanes))).into_iter().collect();
+        let in_strips = blend.in_strips;
+        let loss = if in_strips { LOSS_STRIPS } else { SHARED };
+        let ssim = if in_strips {
+            Ssim::Strips {
+                means: Pipeline::new(gpu, kernel!("loss", "ssim_strips", LOSS_STRIPS), &[])?,
+                upstream: Pipeline::new(gpu, kernel!("loss", "ssim_upstream_strips", LOSS_STRIPS), &[])?,
+            }
+        } else {
+            Ssim::Tiles(Pipeline::new(gpu, kernel!("loss", "ssim", SHARED), &[])?)
+        };
         Ok(Self {
-            ssim: Pipeline::new(gpu, kernel!("loss", "ssim", SHARED), &[])?,
-            loss: Pipeline::new(gpu, kernel!("loss", "loss_backward", SHARED), &[("SSIM", 1.0)])?,
-            loss_without_ssim: Pipeline::new(gpu, kernel!("loss", "loss_backward", SHARED), &[("SSIM", 0.0)])?,
+            ssim,
+            loss: Pipeline::new(gpu, kernel!("loss", "loss_backward", loss), &[("SSIM", 1.0)])?,
+            loss_without_ssim: Pipeline::new(gpu, kernel!("loss", "loss_backward", loss), &[("SSIM", 0.0)])?,
             backward: Pipeline::new(gpu, blend.backward, &lanes)?,
             update: Pipeline::new(gpu, kernel!("update"), &[])?,
             update_with_camera: Pipeline::new(gpu, kernel!("update", WITH_CAMERA), &[])?,

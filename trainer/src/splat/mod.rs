@@ -18,6 +18,8 @@ mod learning;
 mod options;
 mod params;
 mod passes;
+#[cfg(test)]
+mod poison;
 pub mod reference;
 #[cfg(test)]
 mod resuming;

@@ -1,8 +1,8 @@
 //! The stages of drawing and learning, as lists of passes.
 
 use super::buffers::{BLOCK, Frame, GROUP, Scratch, SplatBuffers, WINDOW_BINS, n_bins, n_tiles};
-use super::kernels::{DrawPipelines, LearnPipelines, UnorderedPipelines};
-use super::params::Growth;
+use super::kernels::{DrawPipelines, LearnPipelines, Ssim, UnorderedPipelines};
+use super::params::{Growth, TILE_PX};
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 
 /// What the passes of one view touch.
@@ -96,6 +96,11 @@ pub(crate) fn grow(
             ("error_sums", &splats.error_sums),
         ],
     );
+}
+
+/// Workgroups of the kernels that import `rows_and_columns`: each has a color of two tiles below each other.
+fn n_color_strips(size_px: [u32; 2]) -> u64 {
+    3 * u64::from(size_px[0].div_ceil(TILE_PX)) * u64::from(size_px[1].div_ceil(2 * TILE_PX))
 }
 
 impl ViewPasses<'_> {
@@ -207,7 +212,15 @@ impl ViewPasses<'_> {
         if target.ssim {
             let mut buffers = base.to_vec();
             buffers.push(("slopes", &frame.slopes));
-            passes.dispatch(gpu, &pipelines.ssim, n_groups, &buffers);
+            match &pipelines.ssim {
+                Ssim::Tiles(ssim) => passes.dispatch(gpu, ssim, n_groups, &buffers),
+                Ssim::Strips { means, upstream } => {
+                    let n_groups = n_color_strips(self.size_px);
+                    passes.dispatch(gpu, means, n_groups, &buffers);
+                    buffers.push(("upstream", &frame.upstream));
+                    passes.dispatch(gpu, upstream, n_groups, &buffers);
+                }
+            }
         }
         let mut buffers = base.to_vec();
         buffers.extend([

@@ -5,6 +5,7 @@
 )]
 
 use super::arrays::SplatArrays;
+use super::views::FAR_M;
 use crate::gpu::{f32_of, f32s_of};
 use crate::{DepthMap, Keyframe};
 use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
@@ -93,12 +94,7 @@ impl Seeder {
         for y in (stride / 2..height).step_by(stride as usize) {
             for x in (stride / 2..width).step_by(stride as usize) {
                 let z = at(x, y);
-                if !(z > 0.0 && z.is_finite())
-                    || x < stride
-                    || y < stride
-                    || x + stride >= width
-                    || y + stride >= height
-                {
+                if !(z > 0.0 && z <= FAR_M) || x < stride || y < stride || x + stride >= width || y + stride >= height {
                     continue;
                 }
                 let around = [at(x - stride, y), at(x + stride, y), at(x, y - stride), at(x, y + stride)];

@@ -580,13 +580,21 @@ impl SplatTrainer {
         self.idle_since = done;
         let millis = (done - began).as_secs_f64() * 1e3 / in_flight.n_steps.max(1) as f64;
         self.step_millis = if self.step_millis == 0.0 { millis } else { 0.8 * self.step_millis + 0.2 * millis };
-        self.n_poisoned = u64::from(counters[status::N_POISONED]);
+        self.note_poisoned(counters[status::N_POISONED].into());
         let failed = self.mend(&counters)?;
         if failed {
             self.step = u64::from(counters[status::STEP]);
             self.gpu.write(&self.learn_status, 4 * status::FAILED as u64, &[0; 12]);
         }
         Ok(failed)
+    }
+
+    /// Takes note of gradients that were not finite; says so at first, and whenever there are twice as many.
+    fn note_poisoned(&mut self, n_poisoned: u64) {
+        if n_poisoned.checked_ilog2() > self.n_poisoned.checked_ilog2() {
+            log::warn!("{n_poisoned} gradients of splats were not finite so far and were dropped");
+        }
+        self.n_poisoned = n_poisoned;
     }
 
     /// Step from which there are no more splats.
@@ -771,6 +779,14 @@ impl Method for SplatTrainer {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         self.settle()?; // The step at which it comes must be true.
         if keyframe.split == Split::Test {
+            return Ok(());
+        }
+        if !keyframe.is_finite() {
+            log::warn!(
+                "the image of {} at {} ns is left out: its pose, lens or velocity is not finite",
+                keyframe.camera,
+                keyframe.stamp.0
+            );
             return Ok(());
         }
         let keyframe = self.aligning.corrected(&keyframe);

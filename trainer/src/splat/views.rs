@@ -13,7 +13,7 @@ use std::sync::Arc;
 
 /// Nearest and furthest a splat may be from a keyframe's camera along z to be learned from it, metres.
 const NEAR_M: f64 = 0.01;
-const FAR_M: f64 = 1e4;
+pub(crate) const FAR_M: f64 = 1e4;
 
 /// One keyframe that is learned from.
 #[derive(Debug)]

@@ -1,0 +1,102 @@
+//! Range scans as Foxglove's `PointCloud`.
+//!
+//! A point is 20 bytes, little endian: x, y, z as f32 in metres, ring as u16 and two unused bytes, microseconds since the stamp as
+//! u32. Every bit comes back.
+
+use super::Malformed;
+use super::foxglove::{stamp_from, timestamp};
+use super::protobuf::{Message, fields};
+use crate::{RangePoint, RangeScan};
+use std::sync::Arc;
+
+const STRIDE: u32 = 20;
+/// Name, offset in the point, and Foxglove's number of the type: 3 is a u16, 5 a u32, 7 an f32.
+const FIELDS: [(&str, u32, u64); 5] =
+    [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("ring", 12, 3), ("time_offset_micros", 16, 5)];
+
+/// A scan as the message [`super::descriptor::POINT_CLOUD`].
+pub fn encode(scan: &RangeScan) -> Vec<u8> {
+    let mut data = Vec::with_capacity(scan.points.len() * STRIDE as usize);
+    for point in scan.points.iter() {
+        data.extend(point.position_m.iter().flat_map(|metres| metres.to_le_bytes()));
+        data.extend(point.ring.to_le_bytes());
+        data.extend([0; 2]);
+        data.extend(point.offset_micros.to_le_bytes());
+    }
+    let mut message = Message::with_capacity(data.len() + 256);
+    message.message(1, &timestamp(scan.stamp)).bytes(2, scan.scanner.as_bytes());
+    message.message(3, &identity()).fixed32(4, STRIDE);
+    for (name, offset, kind) in FIELDS {
+        let mut field = Message::default();
+        field.bytes(1, name.as_bytes()).fixed32(2, offset).varint(3, kind);
+        message.message(5, &field);
+    }
+    message.bytes(6, &data);
+    message.into_bytes()
+}
+
+/// The points are in the frame of the scanner itself.
+fn identity() -> Message {
+    let (mut position, mut orientation, mut pose) = (Message::default(), Message::default(), Message::default());
+    position.double(1, 0.0).double(2, 0.0).double(3, 0.0);
+    orientation.double(1, 0.0).double(2, 0.0).double(3, 0.0).double(4, 1.0);
+    pose.message(1, &position).message(2, &orientation);
+    pose
+}
+
+/// The scan that [`encode`] wrote; a cloud of another layout is refused.
+pub fn decode(bytes: &[u8]) -> Result<RangeScan, Malformed> {
+    let (mut stamp, mut scanner, mut stride, mut points) = (None, Arc::from(""), None, None);
+    for field in fields(bytes) {
+        let field = field?;
+        match field.number {
+            1 => stamp = Some(stamp_from(&field)?),
+            2 => scanner = field.text()?.into(),
+            4 => stride = Some(field.fixed32()?),
+            6 => points = Some(field.bytes()?),
+            _ => {}
+        }
+    }
+    let data = points.ok_or(Malformed::Missing { name: "data" })?;
+    if stride != Some(STRIDE) || data.len() % STRIDE as usize != 0 {
+        return Err(Malformed::Range { field: 4 });
+    }
+    let stamp = stamp.ok_or(Malformed::Missing { name: "timestamp" })?;
+    Ok(RangeScan { scanner, stamp, points: data.as_chunks::<{ STRIDE as usize }>().0.iter().map(point).collect() })
+}
+
+fn point(bytes: &[u8; STRIDE as usize]) -> RangePoint {
+    let four = |at: usize| [bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]];
+    RangePoint {
+        position_m: [0, 4, 8].map(|at| f32::from_le_bytes(four(at))),
+        ring: u16::from_le_bytes([bytes[12], bytes[13]]),
+        offset_micros: u32::from_le_bytes(four(16)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use kinematics::Stamp;
+
+    #[test]
+    fn scans_come_back_bit_for_bit_and_other_layouts_are_refused() {
+        let point =
+            |x: f32, ring| RangePoint { position_m: [x, -0.0, 1e-30], ring, offset_micros: 7 + u32::from(ring) };
+        let points: Arc<[RangePoint]> = [point(1.5, 0), point(-3.25, u16::MAX)].into();
+        for points in [points, [].into()] {
+            let scan = RangeScan { scanner: "lidar".into(), stamp: Stamp(-12_345_678_901), points };
+            let bytes = encode(&scan);
+            assert_eq!(decode(&bytes).as_ref(), Ok(&scan));
+            let read = decode(&bytes).expect("own bytes");
+            let bits = |scan: &RangeScan| -> Vec<u32> {
+                scan.points.iter().flat_map(|point| point.position_m.map(f32::to_bits)).collect()
+            };
+            assert_eq!(bits(&read), bits(&scan));
+        }
+        let mut other = Message::default();
+        other.message(1, &timestamp(Stamp(1))).fixed32(4, 16).bytes(6, &[0; 32]);
+        assert_eq!(decode(&other.into_bytes()), Err(Malformed::Range { field: 4 }));
+        assert_eq!(decode(&[]), Err(Malformed::Missing { name: "data" }));
+    }
+}

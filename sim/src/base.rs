@@ -1,0 +1,233 @@
+//! How the robot's base moves: not at all, walking round a pedestal, or from one stand to the next.
+
+use crate::config::Scene;
+use crate::random::Random;
+use kinematics::Transform;
+use nalgebra::{Translation3, UnitQuaternion, Vector3};
+use std::f64::consts::TAU;
+
+/// The base over time, in closed form: any instant can be asked for.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum BaseMotion {
+    /// The base is the world's origin.
+    Still,
+    /// A quadruped crabs round the origin, its front mostly turned inwards; the factor on its speed.
+    Lap(f64),
+    /// A first stand far off, then a second close by; the factor on the speed.
+    Stands(f64),
+}
+
+/// Seconds a lap at speed 1, and the laps that count as the whole walk.
+const LAP_SECS: f64 = 36.0;
+/// Steps of the gait a second at speed 1, and what a step does to the body.
+const GAIT_HZ: f64 = 1.7;
+const BOUNCE_M: f64 = 0.007;
+const ROLL_RAD: f64 = 0.008;
+const PITCH_RAD: f64 = 0.006;
+/// Height of the body's middle above the floor, metres.
+pub(crate) const BODY_Z_M: f64 = 0.52;
+
+/// When the base leaves its first stand and how long it walks to the second, seconds at speed 1.
+const LEAVES_SECS: f64 = 14.0;
+const WALKS_SECS: f64 = 5.0;
+/// The stands: x, y and heading, metres and radians.
+const FAR_STAND: [f64; 3] = [0.0, 0.15, -0.06];
+const NEAR_STAND: [f64; 3] = [1.15, 0.0, 0.02];
+
+/// Where the arm stands on the quadruped's back; `mount` in the URDFs.
+pub(crate) fn base_from_arm() -> Transform {
+    Transform::translation(0.12, 0.0, 0.10)
+}
+
+/// 0 below zero, 1 above one, smooth with a smooth slope between.
+pub(crate) fn smooth(share: f64) -> f64 {
+    let share = share.clamp(0.0, 1.0);
+    share.powi(3) * (10.0 - 15.0 * share + 6.0 * share * share)
+}
+
+/// A sine with a mean: mean, amplitude, period in seconds, phase in turns.
+pub(crate) fn swing([mean, amplitude, period, phase]: [f64; 4], at: f64) -> f64 {
+    mean + amplitude * ((at / period + phase) * TAU).sin()
+}
+
+impl BaseMotion {
+    /// The motion of a scene's base.
+    pub(crate) fn of(scene: Scene, speed: f64) -> Self {
+        match scene {
+            Scene::StaticArm => Self::Still,
+            Scene::MobileBase => Self::Lap(speed),
+            Scene::MobileArm => Self::Stands(speed),
+        }
+    }
+
+    /// Share of the whole walk (one lap, or from the first stand to the last) that lies behind; goes on past 1.
+    pub(crate) fn walked_share(&self, secs: f64) -> f64 {
+        match self {
+            Self::Still => 0.0,
+            Self::Lap(speed) => lap_secs(secs, *speed) / LAP_SECS,
+            Self::Stands(speed) => smooth((secs * speed - LEAVES_SECS) / WALKS_SECS),
+        }
+    }
+
+    /// True pose of the base.
+    pub(crate) fn world_from_base(&self, secs: f64) -> Transform {
+        match self {
+            Self::Still => Transform::identity(),
+            Self::Lap(speed) => on_lap(lap_secs(secs, *speed), secs * speed),
+            Self::Stands(_) => {
+                let share = self.walked_share(secs);
+                let [x, y, yaw] = std::array::from_fn(|ix| FAR_STAND[ix] + (NEAR_STAND[ix] - FAR_STAND[ix]) * share);
+                // The gait fades out before the base stands.
+                let vigor = (4.0 * share * (1.0 - share)).clamp(0.0, 1.0);
+                gait(secs, vigor, [x, y, yaw])
+            }
+        }
+    }
+
+    /// When the base leaves its first stand and when it comes to its last, seconds; zero where it has none.
+    pub(crate) fn walk_secs(&self) -> [f64; 2] {
+        match self {
+            Self::Stands(speed) => [LEAVES_SECS / speed, (LEAVES_SECS + WALKS_SECS) / speed],
+            Self::Still | Self::Lap(_) => [0.0; 2],
+        }
+    }
+
+    /// Whether the base stands and the arm may scan: seconds since it came to stand, and at which stand.
+    pub(crate) fn standing(&self, secs: f64) -> Option<(usize, f64)> {
+        match self {
+            Self::Still => Some((0, secs)),
+            Self::Lap(_) => None,
+            Self::Stands(speed) => {
+                let at = secs * speed;
+                if at < LEAVES_SECS {
+                    Some((0, at))
+                } else {
+                    (at > LEAVES_SECS + WALKS_SECS).then_some((1, at - LEAVES_SECS - WALKS_SECS))
+                }
+            }
+        }
+    }
+}
+
+/// Progress along the laps in seconds at even speed: starts at rest, then quickens and slackens by a third.
+fn lap_secs(secs: f64, speed: f64) -> f64 {
+    const START_SECS: f64 = 1.5;
+    const SWING: (f64, f64) = (0.35, 7.3);
+    let at = secs * speed;
+    let ramp = (at / START_SECS).clamp(0.0, 1.0);
+    let started = START_SECS * (ramp.powi(3) - 0.5 * ramp.powi(4)) + (at - START_SECS).max(0.0);
+    // Its slope starts at zero too, so the first step is soft.
+    started + SWING.0 * SWING.1 / TAU * (1.0 - (started * TAU / SWING.1).cos())
+}
+
+fn on_lap(at: f64, gait_secs: f64) -> Transform {
+    let around = at / LAP_SECS * TAU + std::f64::consts::PI;
+    let radius_m = swing([2.25, 0.38, 23.0, 0.1], at);
+    // From looking at the pedestal to looking past it.
+    let aside_rad = swing([0.25, 0.55, 15.7, 0.0], at);
+    let position = [radius_m * around.cos(), radius_m * around.sin(), around + std::f64::consts::PI + aside_rad];
+    gait(gait_secs, smooth(at / 2.0), position)
+}
+
+/// The body on its legs at a place and heading, bouncing and swaying.
+fn gait(secs: f64, vigor: f64, [x, y, yaw]: [f64; 3]) -> Transform {
+    let step = secs * GAIT_HZ * TAU;
+    let bounce_m = BOUNCE_M * vigor * (2.0 * step).sin();
+    let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw)
+        * UnitQuaternion::from_axis_angle(&Vector3::y_axis(), PITCH_RAD * vigor * (2.0 * step + 0.7).sin())
+        * UnitQuaternion::from_axis_angle(&Vector3::x_axis(), ROLL_RAD * vigor * step.sin());
+    Transform::from_parts(Translation3::new(x, y, BODY_Z_M + bounce_m), turn)
+}
+
+/// What a SLAM system gets wrong: a random walk that goes on as long as the base walks.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Drift {
+    random: Random,
+    /// Standard deviations of one step along or about x, y, z.
+    step_m: [f64; 3],
+    step_rad: [f64; 3],
+}
+
+/// Steps of the random walk over the whole walk.
+const N_STEPS: f64 = 64.0;
+/// Height, roll and pitch are kept by gravity and the floor: their errors relative to the others.
+const MINOR: f64 = 0.3;
+/// Names the stream of random numbers.
+const DRIFT: u64 = 0xd41f;
+
+impl Drift {
+    /// `size_m` and `size_rad` are the root mean square of the error at the end of the whole walk.
+    pub(crate) fn new(seed: u64, size_m: f64, size_rad: f64) -> Self {
+        let per_step = |size: f64, weights: [f64; 3]| {
+            let norm = weights.iter().map(|weight| weight * weight).sum::<f64>().sqrt();
+            weights.map(|weight| size * weight / norm / N_STEPS.sqrt())
+        };
+        Self {
+            random: Random::new(seed, &[DRIFT]),
+            step_m: per_step(size_m, [1.0, 1.0, MINOR]),
+            step_rad: per_step(size_rad, [MINOR, MINOR, 1.0]),
+        }
+    }
+
+    /// The pose that is told for a true pose after a share of the walk.
+    pub(crate) fn told(&self, world_from_base: &Transform, walked_share: f64) -> Transform {
+        let steps = walked_share * N_STEPS;
+        let (mut shift, mut turn) = (Vector3::zeros(), Vector3::zeros());
+        let mut step = 0_u64;
+        // Sums from the start: a few hundred steps even after a long run, and no state that could go out of step.
+        while (step as f64) < steps {
+            let share = smooth(steps - step as f64);
+            let [a, b] = [2 * step, 2 * step + 1].map(|counter| self.random.normals(counter).map(f64::from));
+            shift += Vector3::from_fn(|axis, _| self.step_m[axis] * a[axis]) * share;
+            turn += Vector3::from_fn(|axis, _| self.step_rad[axis] * b[axis]) * share;
+            step += 1;
+        }
+        let rotation = UnitQuaternion::from_scaled_axis(turn) * world_from_base.rotation;
+        Transform::from_parts((world_from_base.translation.vector + shift).into(), rotation)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_drift_has_the_size_asked_for_and_starts_at_zero() {
+        const TOLERANCE: f64 = 0.1; // Four standard errors of a root mean square over this many seeds.
+        const N_SEEDS: u64 = 800;
+        for (walked_share, growth) in [(1.0, 1.0_f64), (0.25, 0.5), (4.0, 2.0)] {
+            let (mut squares_m, mut squares_rad) = (0.0, 0.0);
+            for seed in 0..N_SEEDS {
+                let drift = Drift::new(seed, 0.02, 0.0175);
+                let truth = BaseMotion::Lap(1.0).world_from_base(17.0);
+                let told = drift.told(&truth, walked_share);
+                squares_m += (told.translation.vector - truth.translation.vector).norm_squared();
+                squares_rad += told.rotation.angle_to(&truth.rotation).powi(2);
+                assert_eq!(drift.told(&truth, 0.0), truth);
+            }
+            let [rms_m, rms_rad] = [squares_m, squares_rad].map(|squares| (squares / N_SEEDS as f64).sqrt());
+            assert!((rms_m / (0.02 * growth) - 1.0).abs() < TOLERANCE, "{rms_m} m after {walked_share}");
+            assert!((rms_rad / (0.0175 * growth) - 1.0).abs() < TOLERANCE, "{rms_rad} rad after {walked_share}");
+        }
+    }
+
+    #[test]
+    fn the_base_walks_smoothly_and_rests_at_its_stands() {
+        const STEP_SECS: f64 = 1e-3;
+        for (motion, fastest_m_s) in [(BaseMotion::Lap(1.0), 0.9), (BaseMotion::Stands(1.0), 0.6)] {
+            let mut before = motion.world_from_base(0.0);
+            let mut speed_before = 0.0;
+            for step in 1..60_000 {
+                let secs = f64::from(step) * STEP_SECS;
+                let pose = motion.world_from_base(secs);
+                let speed = (pose.translation.vector - before.translation.vector).norm() / STEP_SECS;
+                assert!(speed < fastest_m_s, "{motion:?}: {speed} m/s at {secs} s");
+                assert!((speed - speed_before).abs() / STEP_SECS < 4.0, "{motion:?}: a jerk at {secs} s");
+                if motion.standing(secs).is_some() {
+                    assert!(speed < 1e-9, "{motion:?} moves at {secs} s while it stands");
+                }
+                (before, speed_before) = (pose, speed);
+            }
+        }
+    }
+}

@@ -1,0 +1,87 @@
+//! A turning range scanner: a ray a direction, from where the scanner is at that instant.
+#![expect(clippy::cast_possible_truncation, reason = "points are told in f32, times of a turn fit their integers")]
+
+use crate::Error;
+use crate::config::ScannerConfig;
+use crate::random::Random;
+use crate::scene::ARM_GROUP;
+use drivers::RangePoint;
+use kinematics::Transform;
+use mujoco_rs::prelude::{MjData, MjModel};
+use nalgebra::Vector3;
+use std::sync::Arc;
+
+/// The scene for rays: it stands still, and rays do not see the robot, nor glass.
+pub(crate) struct RayCaster {
+    data: MjData<Arc<MjModel>>,
+}
+
+/// Groups of geometry that rays see: all but the robot and glass.
+fn seen_groups() -> [u8; 6] {
+    let mut groups = [1; 6];
+    groups[ARM_GROUP] = 0;
+    groups[crate::scene::GLASS_GROUP] = 0;
+    groups
+}
+
+impl RayCaster {
+    pub(crate) fn new(model: Arc<MjModel>) -> Self {
+        let mut data = MjData::new(model);
+        data.forward();
+        Self { data }
+    }
+
+    /// Distances along unit vectors from one point, metres; `None` where a ray meets nothing within `reach_m`.
+    fn cast(&mut self, from: &Vector3<f64>, towards: &[[f64; 3]], reach_m: f64) -> Result<Vec<Option<f64>>, Error> {
+        let origin = [from.x, from.y, from.z];
+        let groups = seen_groups();
+        let (_, distances) = self
+            .data
+            .try_multi_ray(&origin, towards, Some(&groups), true, None, reach_m, None)
+            .map_err(|error| Error::Rays { reason: error.to_string() })?;
+        Ok(distances.into_iter().map(|distance| (distance >= 0.0).then_some(distance)).collect())
+    }
+}
+
+/// One turn that began at a time; `world_from_base` tells where the base is so many nanoseconds after it.
+pub(crate) fn turn(
+    rays: &mut RayCaster,
+    scanner: &ScannerConfig,
+    ideal: bool,
+    random: Random,
+    world_from_base: impl Fn(i64) -> Transform,
+) -> Result<Vec<RangePoint>, Error> {
+    let period_nanos = 1e9 / scanner.rate_hz;
+    let [lowest, highest] = scanner.elevation_rad;
+    let rise = if scanner.n_rings > 1 { (highest - lowest) / f64::from(scanner.n_rings - 1) } else { 0.0 };
+    let mut points = Vec::new();
+    for column in 0..scanner.n_columns {
+        let share = f64::from(column) / f64::from(scanner.n_columns);
+        // Whole microseconds, for that is what a point tells.
+        let offset_micros = (share * period_nanos * 1e-3) as u32;
+        let world_from_scanner = world_from_base(i64::from(offset_micros) * 1000) * scanner.base_from_scanner;
+        let (sin, cos) = (share * std::f64::consts::TAU).sin_cos();
+        let directions: Vec<Vector3<f64>> = (0..scanner.n_rings)
+            .map(|ring| {
+                let (up, flat) = (lowest + rise * f64::from(ring)).sin_cos();
+                Vector3::new(flat * cos, flat * sin, up)
+            })
+            .collect();
+        let in_world: Vec<[f64; 3]> =
+            directions.iter().map(|direction| (world_from_scanner.rotation * direction).into()).collect();
+        let distances = rays.cast(&world_from_scanner.translation.vector, &in_world, scanner.max_m)?;
+        for (ring, (direction, distance_m)) in directions.iter().zip(distances).enumerate() {
+            let counter = u64::from(column) * u64::from(scanner.n_rings) + ring as u64;
+            let Some(true_m) = distance_m else { continue };
+            let is_lost = !ideal && random.unit(2 * counter) < scanner.dropped_frac;
+            let noise = if ideal { 0.0 } else { f64::from(random.normals(2 * counter + 1)[0]) };
+            let range_m = true_m + scanner.noise_sigma_m * noise;
+            if is_lost || range_m < scanner.min_m || range_m > scanner.max_m {
+                continue;
+            }
+            let position_m = (direction * range_m).map(|metres| metres as f32).into();
+            points.push(RangePoint { position_m, ring: ring as u16, offset_micros });
+        }
+    }
+    Ok(points)
+}

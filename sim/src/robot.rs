@@ -1,0 +1,58 @@
+//! The robot as a whole: where its base is, and what its arm does if it has one.
+
+use crate::arm::{Arm, Reading, STEP_NANOS};
+use crate::base::BaseMotion;
+use crate::panda::{self, Joints};
+use kinematics::Transform;
+
+/// Where the robot is at one instant.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Posture {
+    pub(crate) world_from_base: Transform,
+    pub(crate) base_from_arm: Transform,
+    /// `None` where there is no arm.
+    pub(crate) joints_rad: Option<Joints>,
+}
+
+impl Posture {
+    /// Pose of the flange; of the arm's place where there is no arm.
+    pub(crate) fn world_from_flange(&self) -> Transform {
+        let arm_from_flange = self.joints_rad.as_ref().map_or_else(Transform::identity, panda::base_from_flange);
+        self.world_from_base * self.base_from_arm * arm_from_flange
+    }
+}
+
+/// The robot in motion.
+pub(crate) struct Robot {
+    arm: Option<Arm>,
+    motion: BaseMotion,
+    base_from_arm: Transform,
+    n_steps: i64,
+}
+
+impl Robot {
+    pub(crate) fn new(arm: Option<Arm>, motion: BaseMotion, base_from_arm: Transform) -> Self {
+        Self { arm, motion, base_from_arm, n_steps: 0 }
+    }
+
+    pub(crate) fn motion(&self) -> &BaseMotion {
+        &self.motion
+    }
+
+    /// Moves on by one step; gives the time before it, nanoseconds, and what the arm's joints told then.
+    pub(crate) fn step(&mut self) -> (i64, Option<Reading>) {
+        let nanos = self.n_steps * STEP_NANOS;
+        self.n_steps += 1;
+        (nanos, self.arm.as_mut().map(Arm::step))
+    }
+
+    /// The robot at a time in its recent past; `None` where the arm's readings do not reach.
+    pub(crate) fn at(&self, nanos: i64) -> Option<Posture> {
+        let joints_rad = match &self.arm {
+            Some(arm) => Some(arm.position_at(nanos)?),
+            None => None,
+        };
+        let world_from_base = self.motion.world_from_base(nanos as f64 * 1e-9);
+        Some(Posture { world_from_base, base_from_arm: self.base_from_arm, joints_rad })
+    }
+}

@@ -1,0 +1,97 @@
+//! What is not a number, or no image, or no splat: training goes on, and nothing of it reaches a parameter.
+
+use super::SplatTrainer;
+use super::cloud::synthetic_cloud;
+use super::learning::{keyframes, options, test_psnr, train};
+use crate::gpu::{Gpu, GpuOptions, f32_of};
+use crate::{DepthMap, Keyframe, Method};
+use kinematics::{Stamp, Transform, Twist};
+use nalgebra::{Point3, Vector3};
+use std::sync::Arc;
+
+/// Spoiled keyframes among good ones: whatever is wrong with them, the others are learned from as if they were not there.
+#[test]
+fn spoiled_keyframes_cost_no_parameter_and_no_other_keyframe() {
+    const N_STEPS: u64 = 120;
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let good = keyframes(&gpu, true);
+    let with_depth = |of: fn(usize, f32) -> f32| {
+        let spoiled = good[1].as_ref().clone();
+        let depth = spoiled.depth.clone().unwrap();
+        let depth_m = depth.depth_m.iter().enumerate().map(|(ix, z)| of(ix, *z)).collect();
+        Keyframe { depth: Some(DepthMap { depth_m, ..depth }), ..spoiled }
+    };
+    let plain = good[1].as_ref().clone();
+    let one_pixel = |depth: Option<DepthMap>| Keyframe {
+        size_px: [1, 1],
+        principal_px: [0.5; 2],
+        rgba_srgb: [200, 100, 50, 255].into(),
+        depth,
+        ..plain.clone()
+    };
+    let spoiled = [
+        with_depth(|ix, z| if ix % 2 == 0 { f32::NAN } else { z }),
+        with_depth(|_, _| f32::INFINITY),
+        with_depth(|ix, z| if ix % 3 == 0 { -z } else { f32::MAX }),
+        one_pixel(None),
+        one_pixel(plain.depth.clone()),
+        Keyframe { focal_px: [f64::NAN; 2], ..plain.clone() },
+        Keyframe { world_from_camera: Transform::translation(f64::NAN, 0.0, 0.0), ..plain.clone() },
+        Keyframe { world_from_camera: Transform::translation(f64::INFINITY, 0.0, 0.0), ..plain.clone() },
+        Keyframe {
+            twist: Some(Twist { linear_m_s: Vector3::repeat(f64::NAN), angular_rad_s: Vector3::zeros() }),
+            readout_secs: 0.015,
+            ..plain.clone()
+        },
+    ];
+    let learned = |spoiled: &[Keyframe]| {
+        let mut trainer = SplatTrainer::new(gpu.clone(), options()).unwrap();
+        for keyframe in &good {
+            trainer.push(keyframe.clone()).unwrap();
+        }
+        for (keyframe, stamp) in spoiled.iter().zip(900..) {
+            trainer.push(Arc::new(Keyframe { stamp: Stamp(stamp), ..keyframe.clone() })).unwrap();
+        }
+        train(&mut trainer, N_STEPS);
+        assert!(trainer.arrays().unwrap().checked().is_ok());
+        test_psnr(&mut trainer, &good)
+    };
+    let (without, with) = (learned(&[]), learned(&spoiled));
+    assert!(with > without - 1.5, "{with:.2} dB beside spoiled keyframes, {without:.2} dB without");
+}
+
+/// Splats that a file may hold: on the camera's plane, without rotation, huge, almost transparent.
+#[test]
+fn hostile_splats_learn_nothing_that_is_not_finite() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let good = keyframes(&gpu, true);
+    let mut arrays = synthetic_cloud(200, 5);
+    let center = good[1].world_from_camera.translation.vector;
+    let at = |z_m: f64| {
+        let place = good[1].world_from_camera * Point3::new(0.0, 0.0, z_m);
+        [place.x, place.y, place.z].map(f32_of)
+    };
+    arrays.means[0] = center.map(f32_of).into();
+    (arrays.means[1], arrays.means[2], arrays.means[3]) = (at(0.0101), at(-1e-6), [f32::MAX; 3]);
+    arrays.rotations_wxyz[4] = [0.0; 4];
+    arrays.rotations_wxyz[5] = [f32::MAX; 4];
+    arrays.log_scales[6] = [80.0; 3];
+    arrays.log_scales[7] = [-80.0; 3];
+    (arrays.opacity_logits[8], arrays.opacity_logits[9]) = (1e30, -1e30);
+    arrays.sh[16 * 10] = [f32::MAX; 3];
+    let mut trainer = SplatTrainer::from_arrays(gpu, options(), &arrays).unwrap();
+    for keyframe in &good {
+        trainer.push(keyframe.clone()).unwrap();
+    }
+    train(&mut trainer, 60);
+    let learned = trainer.arrays().unwrap();
+    let numbers = [
+        learned.means.as_flattened(),
+        learned.log_scales.as_flattened(),
+        learned.rotations_wxyz.as_flattened(),
+        learned.sh.as_flattened(),
+        &learned.opacity_logits,
+    ];
+    assert!(numbers.into_iter().flatten().all(|number| number.is_finite()));
+    assert!(learned.means[20..] != arrays.means[20..], "the others learn");
+}
