@@ -1,7 +1,8 @@
 //! From the bytes of a device to plain pixels and metres.
 
 use crate::{Error, Image, PixelFormat};
-use image::ImageFormat;
+use image::{DynamicImage, ImageError, ImageFormat};
+use std::io::ErrorKind;
 
 impl Image {
     /// Whether this is a depth image.
@@ -53,7 +54,7 @@ impl Image {
     }
 
     fn decompress(&self, format: ImageFormat) -> Result<Vec<u8>, Error> {
-        let decoded = image::load_from_memory_with_format(&self.data, format)
+        let decoded = decode_whole(&self.data, Some(format))
             .map_err(|source| Error::Undecodable { camera: self.camera.to_string(), stamp: self.stamp, source })?
             .into_rgb8();
         let got_px = [decoded.width(), decoded.height()];
@@ -73,6 +74,31 @@ impl Image {
     }
 }
 
+/// Decodes an image of a format that is given or guessed; one that is cut off is an error, too: decoders of JPEG fill up with grey.
+pub(crate) fn decode_whole(bytes: &[u8], format: Option<ImageFormat>) -> Result<DynamicImage, ImageError> {
+    let format = format.map_or_else(|| image::guess_format(bytes), Ok)?;
+    if format == ImageFormat::Jpeg && !ends(bytes) {
+        return Err(ImageError::IoError(std::io::Error::new(ErrorKind::UnexpectedEof, "the JPEG is cut off")));
+    }
+    image::load_from_memory_with_format(bytes, format)
+}
+
+/// Whether a JPEG has its last marker (ITU-T T.81, B.1.1): it may not come before the first scan, where thumbnails have theirs.
+fn ends(jpeg: &[u8]) -> bool {
+    const START_OF_SCAN: u8 = 0xda;
+    const END_OF_IMAGE: [u8; 2] = [0xff, 0xd9];
+    let mut rest = jpeg.get(2..).unwrap_or_default();
+    while let [0xff, marker, high, low, ..] = rest {
+        if *marker == START_OF_SCAN {
+            return rest.windows(2).any(|pair| pair == END_OF_IMAGE);
+        }
+        // Markers may be padded with 0xff; the length counts its own two bytes.
+        let n_bytes = if *marker == 0xff { 1 } else { 2 + usize::from(u16::from_be_bytes([*high, *low])) };
+        rest = rest.get(n_bytes..).unwrap_or_default();
+    }
+    false
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -90,18 +116,33 @@ mod tests {
         }
     }
 
-    fn png_of(size_px: [u32; 2], rgb: &[u8]) -> Vec<u8> {
+    fn file_of(format: ImageFormat, [width, height]: [u32; 2], rgb: &[u8]) -> Vec<u8> {
         let mut file = std::io::Cursor::new(Vec::new());
-        image::write_buffer_with_format(
-            &mut file,
-            rgb,
-            size_px[0],
-            size_px[1],
-            image::ExtendedColorType::Rgb8,
-            ImageFormat::Png,
-        )
-        .expect("a small picture");
+        image::write_buffer_with_format(&mut file, rgb, width, height, image::ExtendedColorType::Rgb8, format)
+            .expect("a small picture");
         file.into_inner()
+    }
+
+    fn png_of(size_px: [u32; 2], rgb: &[u8]) -> Vec<u8> {
+        file_of(ImageFormat::Png, size_px, rgb)
+    }
+
+    #[test]
+    fn a_jpeg_that_is_cut_off_is_refused_wherever_it_is_cut() {
+        let rgb: Vec<u8> = (0..3 * 64 * 64).map(|ix: u32| (ix * ix % 251) as u8).collect();
+        let whole = file_of(ImageFormat::Jpeg, [64, 64], &rgb);
+        let decode = |data: &[u8]| image(PixelFormat::Jpeg, [64, 64], data).decode_rgb();
+        assert_eq!(decode(&whole).expect("whole").len(), rgb.len());
+        assert!(decode(&[&whole[..], b"what a camera appends"].concat()).is_ok());
+        for n_bytes in [whole.len() - 2, whole.len() * 9 / 10, whole.len() / 2, 20, 3, 0] {
+            let error = decode(&whole[..n_bytes]).expect_err("cut off");
+            assert!(matches!(error, Error::Undecodable { .. }), "{n_bytes}: {error}");
+        }
+        // A thumbnail among the first segments ends, the image does not.
+        let mut with_thumbnail = [&whole[..2], &[0xff, 0xe1, 0, 6, 0xff, 0xd8, 0xff, 0xd9], &whole[2..]].concat();
+        assert!(decode(&with_thumbnail).is_ok());
+        with_thumbnail.truncate(whole.len() - 100);
+        assert!(decode(&with_thumbnail).is_err());
     }
 
     #[test]

@@ -61,6 +61,11 @@ pub fn to_rows(transform: &Transform) -> [f64; 16] {
     std::array::from_fn(|at| matrix[(at / 4, at % 4)])
 }
 
+/// Whether a pose is made of numbers.
+pub fn is_finite(transform: &Transform) -> bool {
+    transform.translation.vector.iter().chain(transform.rotation.coords.iter()).all(|number| number.is_finite())
+}
+
 /// Pose between `a` (`frac` 0) and `b` (`frac` 1): translation on a line, rotation at a constant rate the shorter way round.
 pub fn interpolate(a: &Transform, b: &Transform, frac: f64) -> Transform {
     let translation = a.translation.vector.lerp(&b.translation.vector, frac);

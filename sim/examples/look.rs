@@ -113,16 +113,5 @@ fn mobile_base(config: &mut Config) {
         camera.rate_hz = 1.0;
         config.cameras.push(camera);
     }
-    config.scanners.push(sim::ScannerConfig {
-        name: "lidar".to_owned(),
-        rate_hz: 10.0,
-        base_from_scanner: Isometry3::translation(-0.2, 0.0, 0.2),
-        n_rings: 16,
-        elevation_rad: [-0.2618, 0.2618],
-        n_columns: 900,
-        min_m: 0.4,
-        max_m: 50.0,
-        noise_sigma_m: 0.02,
-        dropped_frac: 0.01,
-    });
+    config.scanners.push(sim::ScannerConfig::sixteen_rings("lidar"));
 }

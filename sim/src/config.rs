@@ -82,6 +82,24 @@ pub struct ScannerConfig {
     pub dropped_frac: f64,
 }
 
+impl ScannerConfig {
+    /// Sixteen rings ten times a second, on the back of the quadruped.
+    pub fn sixteen_rings(name: &str) -> Self {
+        Self {
+            name: name.to_owned(),
+            rate_hz: 10.0,
+            base_from_scanner: Transform::translation(-0.2, 0.0, 0.2),
+            n_rings: 16,
+            elevation_rad: [-0.2618, 0.2618],
+            n_columns: 900,
+            min_m: 0.4,
+            max_m: 50.0,
+            noise_sigma_m: 0.02,
+            dropped_frac: 0.01,
+        }
+    }
+}
+
 /// The scenes that can be built.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Scene {

@@ -16,8 +16,8 @@ const MAX_IMAGES: usize = 8;
 const MAX_READINGS: usize = 1000;
 /// Range scans that wait.
 const MAX_SCANS: usize = 20;
-/// True images and base poses that wait.
-const MAX_TRUTH: usize = 200;
+/// True images of a camera that wait: they are large.
+const MAX_TRUE_IMAGES: usize = 8;
 /// A player that is later than this skips images.
 const MAX_LATE: Duration = Duration::from_millis(50);
 
@@ -37,9 +37,10 @@ pub struct LiveTruth {
 }
 
 impl LiveTruth {
-    /// The oldest truth that was not taken yet, without waiting.
+    /// The oldest truth that was not taken yet, without waiting; poses first.
     pub fn take(&self) -> Option<Sample> {
-        self.player.shared.lock().truth.pop_front()
+        let mut state = self.player.shared.lock();
+        state.true_poses.pop_front().or_else(|| state.true_images.pop_front())
     }
 }
 
@@ -75,7 +76,8 @@ struct State {
     poses: VecDeque<BasePose>,
     /// One a scanner.
     scans: Vec<VecDeque<RangeScan>>,
-    truth: VecDeque<Sample>,
+    true_images: VecDeque<Sample>,
+    true_poses: VecDeque<Sample>,
     /// Why there will be no more samples.
     end: Option<String>,
     stop: bool,
@@ -179,7 +181,8 @@ impl Shared {
                     put(&mut state.scans[scanner_ix], MAX_SCANS, scan);
                 }
             }
-            truth @ (Sample::Truth(_) | Sample::BaseTruth(_)) => put(&mut state.truth, MAX_TRUTH, truth),
+            image @ Sample::Truth(_) => put(&mut state.true_images, MAX_TRUE_IMAGES * names.cameras.len(), image),
+            pose @ Sample::BaseTruth(_) => put(&mut state.true_poses, MAX_READINGS, pose),
         }
         let goes_on = !state.stop;
         drop(state);

@@ -50,18 +50,7 @@ fn mobile_base(rate_hz: f64) -> Config {
         joint_names: vec![],
         reading_order: vec![],
         cameras: vec![camera],
-        scanners: vec![ScannerConfig {
-            name: "lidar".to_owned(),
-            rate_hz: 10.0,
-            base_from_scanner: Isometry3::translation(-0.2, 0.0, 0.2),
-            n_rings: 16,
-            elevation_rad: [-0.2618, 0.2618],
-            n_columns: 180,
-            min_m: 0.4,
-            max_m: 50.0,
-            noise_sigma_m: 0.02,
-            dropped_frac: 0.1,
-        }],
+        scanners: vec![ScannerConfig { n_columns: 180, dropped_frac: 0.1, ..ScannerConfig::sixteen_rings("lidar") }],
         ..Config::default()
     }
 }

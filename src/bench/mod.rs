@@ -5,3 +5,4 @@ pub(crate) mod page;
 pub(crate) mod peer;
 pub(crate) mod runs;
 pub(crate) mod statistics;
+pub(crate) mod variant;

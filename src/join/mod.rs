@@ -325,7 +325,7 @@ impl CameraState {
     /// The keyframe of an image, or why it becomes none; `judge` is off where a list has decided already.
     fn keyframe(&mut self, ripe: Ripe, split: Split, judge: bool, default_depth_m: f64) -> Result<Keyframe, Refusal> {
         let pose = &ripe.posed.world_from_camera;
-        if !motion::is_finite(pose) {
+        if !kinematics::transform::is_finite(pose) {
             return Err(Refusal::PoseNotFinite);
         }
         if judge {

@@ -125,11 +125,6 @@ impl Motion {
     }
 }
 
-/// Whether a pose is made of numbers.
-pub(super) fn is_finite(pose: &Transform) -> bool {
-    pose.translation.vector.iter().chain(pose.rotation.coords.iter()).all(|number| number.is_finite())
-}
-
 /// Mean speed of the image over its centre and the middles of its quarters, pixels per second, of a scene at one depth.
 pub(super) fn image_speed_px_s(twist: &Twist, intrinsics: &Intrinsics, depth_m: f64) -> f64 {
     let [width, height] = intrinsics.size_px.map(f64::from);

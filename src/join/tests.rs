@@ -298,7 +298,7 @@ fn readings_that_are_no_numbers_cost_the_images_around_them() {
     let outcome = play(&mut join, broken);
     assert_eq!(join.counts().joints_refused, 200);
     assert!(join.counts().refused[&Refusal::NoPose] >= 9, "{}", join.counts());
-    assert!(outcome.keyframes.iter().all(|keyframe| super::motion::is_finite(&keyframe.world_from_camera)));
+    assert!(outcome.keyframes.iter().all(|keyframe| kinematics::transform::is_finite(&keyframe.world_from_camera)));
     let mut short = Join::new(&rig).expect("a good rig");
     short.push(Sample::Joints(JointState {
         stamp: Stamp(1),

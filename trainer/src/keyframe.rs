@@ -1,6 +1,6 @@
 //! Posed images accepted for training: plain arrays, no driver types.
 
-use kinematics::{Stamp, Transform, Twist};
+use kinematics::{Stamp, Transform, Twist, transform};
 use std::sync::Arc;
 
 /// What a keyframe may be used for.
@@ -59,21 +59,17 @@ pub struct Keyframe {
 impl Keyframe {
     /// Whether all numbers about the camera are finite; readings of depth may be what they like.
     pub fn is_finite(&self) -> bool {
-        let is_finite = |pose: &Transform| {
-            pose.translation.vector.iter().chain(pose.rotation.coords.iter()).all(|number| number.is_finite())
-        };
         let lens = |focal_px: [f64; 2], principal_px: [f64; 2]| {
             focal_px.iter().all(|focal| focal.is_finite() && *focal > 0.0) && principal_px.iter().all(|x| x.is_finite())
         };
         let twists = self.twist.iter().chain(self.joint_twists.iter());
-        is_finite(&self.world_from_camera)
+        transform::is_finite(&self.world_from_camera)
             && lens(self.focal_px, self.principal_px)
             && self.readout_secs.is_finite()
             && twists.flat_map(|twist| twist.linear_m_s.iter().chain(twist.angular_rad_s.iter())).all(|x| x.is_finite())
-            && self
-                .depth
-                .as_ref()
-                .is_none_or(|depth| is_finite(&depth.world_from_camera) && lens(depth.focal_px, depth.principal_px))
+            && self.depth.as_ref().is_none_or(|depth| {
+                transform::is_finite(&depth.world_from_camera) && lens(depth.focal_px, depth.principal_px)
+            })
     }
 }
 

@@ -1,6 +1,7 @@
 //! One posed photo of a dataset, and the decoding of its files.
 
 use crate::Error;
+use crate::decode::decode_whole;
 use image::{DynamicImage, ImageReader};
 use kinematics::{Intrinsics, Stamp, Transform};
 use std::path::{Path, PathBuf};
@@ -106,7 +107,8 @@ pub(super) fn size_of(path: &Path) -> Result<[u32; 2], Error> {
 }
 
 fn decoded(path: &Path) -> Result<DynamicImage, Error> {
-    reader(path)?.decode().map_err(|source| not_decodable(path, source))
+    let bytes = std::fs::read(path).map_err(|source| Error::Open { path: path.to_owned(), source })?;
+    decode_whole(&bytes, None).map_err(|source| not_decodable(path, source))
 }
 
 fn reader(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::File>>, Error> {

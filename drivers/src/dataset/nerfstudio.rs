@@ -7,7 +7,8 @@ use super::{Dataset, DatasetFrame, DepthFile, FAR_M, LeftOut, plural};
 use crate::Error;
 use kinematics::{Intrinsics, Lens, Stamp, Transform, transform};
 use nalgebra::{UnitQuaternion, Vector3};
-use serde::Deserialize;
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer};
 use std::path::{Path, PathBuf};
 
 /// Name of the file that makes a folder one of these.
@@ -19,7 +20,7 @@ const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
 
 /// Reads a folder, or the file itself.
 ///
-/// Frames come in file-name order. Images that are not there, are no images, or were taken further away than any robot
+/// Frames come in file-name order. Images that are listed twice, are not there, are no images, or were taken further away than any robot
 /// goes, are left out and counted; and so are those whose
 /// pose is not finite or not rigid; a camera model we lack is an error that names the frame.
 pub fn read(path: &Path) -> Result<Dataset, Error> {
@@ -39,6 +40,10 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
 
     let (mut frames, mut left_out, mut notes) = (Vec::new(), LeftOut::default(), Vec::new());
     for (ix, entry) in document.frames.iter().enumerate() {
+        if ix > 0 && document.frames[ix - 1].file_path == entry.file_path {
+            left_out.unusable.push((entry.file_path.clone(), "listed twice, the first counts".to_owned()));
+            continue;
+        }
         let in_frame = |reason: String| wrong(format!("frame {:?}: {reason}", entry.file_path));
         let rows = rows_of(&entry.transform_matrix).map_err(in_frame)?;
         let depth_rows = entry.depth_transform_matrix.as_ref().map(rows_of).transpose().map_err(in_frame)?;
@@ -123,20 +128,39 @@ type Matrix = Vec<Vec<Option<f64>>>;
 #[derive(Clone, Default, Deserialize)]
 struct Camera {
     camera_model: Option<String>,
+    #[serde(default, deserialize_with = "finite")]
     w: Option<f64>,
+    #[serde(default, deserialize_with = "finite")]
     h: Option<f64>,
+    #[serde(default, deserialize_with = "finite")]
     fl_x: Option<f64>,
+    #[serde(default, deserialize_with = "finite")]
     fl_y: Option<f64>,
+    #[serde(default, deserialize_with = "finite")]
     cx: Option<f64>,
+    #[serde(default, deserialize_with = "finite")]
     cy: Option<f64>,
+    #[serde(default, deserialize_with = "finite")]
     camera_angle_x: Option<f64>,
+    #[serde(default, deserialize_with = "finite")]
     k1: Option<f64>,
+    #[serde(default, deserialize_with = "finite")]
     k2: Option<f64>,
+    #[serde(default, deserialize_with = "finite")]
     k3: Option<f64>,
+    #[serde(default, deserialize_with = "finite")]
     k4: Option<f64>,
+    #[serde(default, deserialize_with = "finite")]
     p1: Option<f64>,
+    #[serde(default, deserialize_with = "finite")]
     p2: Option<f64>,
     is_fisheye: Option<bool>,
+}
+
+/// A number that is there and finite; what is not there is no error.
+fn finite<'de, D: Deserializer<'de>>(from: D) -> Result<Option<f64>, D::Error> {
+    let number = Option::<f64>::deserialize(from)?;
+    number.map(Some).ok_or_else(|| D::Error::custom("a parameter of the lens is not a finite number"))
 }
 
 impl Entry {

@@ -168,6 +168,17 @@ fn missing_and_garbage_images_are_left_out_and_counted() {
 }
 
 #[test]
+fn a_photo_that_is_listed_twice_counts_once() {
+    let (folder, mut document) = small_folder();
+    let again = document["frames"][0].clone();
+    document["frames"].as_array_mut().unwrap().push(again);
+    write_transforms(&folder, &document);
+    let dataset = read(folder.path()).unwrap();
+    assert_eq!((dataset.frames.len(), dataset.n_unusable), (2, 1));
+    assert!(dataset.notes[0].contains("b.png (listed twice"), "{:?}", dataset.notes);
+}
+
+#[test]
 fn a_photo_that_breaks_off_fails_by_name() {
     let (folder, document) = small_folder();
     write_transforms(&folder, &document);
@@ -219,6 +230,15 @@ fn a_bad_camera_names_the_frame() {
     assert!(with("\"frames\"", "\"frame\"").contains("missing field `frames`"));
     assert!(with("{", "").contains("neither a recording (.mcap) nor a dataset folder nor a transforms.json"));
     assert!(with("}", "").contains("transforms.json"));
+}
+
+#[test]
+fn lens_parameters_that_are_no_numbers_are_not_taken_for_absent_ones() {
+    let (folder, document) = small_folder();
+    let text = document.to_string().replace("\"fl_y\":6.0", "\"fl_y\":NaN");
+    assert!(text.contains("NaN"));
+    std::fs::write(folder.path().join("transforms.json"), text).unwrap();
+    assert!(complaint(&folder).contains("not a finite number"), "{}", complaint(&folder));
 }
 
 #[test]

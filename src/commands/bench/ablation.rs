@@ -3,45 +3,37 @@
 use crate::bench::page::{Findings, Table};
 use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
 use crate::bench::statistics::{median, sample_std};
+use crate::bench::variant::{CAMERAS_AS_GIVEN, Variant};
 use crate::exit::{self, BadArgument, Exit};
 use crate::training;
 use serde::Serialize;
 use std::collections::HashSet;
 use std::path::PathBuf;
-use trainer::splat::{CameraChoice, CountChoice, SplatOptions};
+use trainer::splat::{CountChoice, SplatOptions};
 
 /// Length of a run where no flag says.
 const USUAL_SECONDS: f64 = 16.0;
 /// Marks that the table tells, seconds.
 const TOLD_SECS: [f64; 2] = [1.0, 4.0];
 
-/// One change of how the trainer learns.
-struct Change {
-    name: &'static str,
-    change: fn(SplatOptions) -> SplatOptions,
-}
-
 /// What all are compared with.
-const WHOLE: Change = Change { name: "as it is", change: |options| options };
+const WHOLE: Variant = Variant { name: "as it is", change: |options| options };
 
-const CHANGES: &[Change] = &[
-    Change { name: "cloud for seeds", change: |options| SplatOptions { seeds_per_image: Some(0.0), ..options } },
-    Change { name: "no depth loss", change: |options| SplatOptions { depth_per_m: 0.0, ..options } },
-    Change { name: "no structure loss", change: |options| SplatOptions { dssim_frac: 0.0, ..options } },
-    Change {
+const CHANGES: &[Variant] = &[
+    Variant { name: "cloud for seeds", change: |options| SplatOptions { seeds_per_image: Some(0.0), ..options } },
+    Variant { name: "no depth loss", change: |options| SplatOptions { depth_per_m: 0.0, ..options } },
+    Variant { name: "no structure loss", change: |options| SplatOptions { dssim_frac: 0.0, ..options } },
+    Variant {
         name: "full size from the start",
         change: |options| SplatOptions { coarse_steps: Some([0; 2]), ..options },
     },
-    Change { name: "black background", change: |options| SplatOptions { varied_background: 0.0, ..options } },
-    Change { name: "opacity and size for free", change: |options| SplatOptions { cost_images: 0.0, ..options } },
-    Change { name: "no growth", change: |options| SplatOptions { growth_frac: 0.0, ..options } },
-    Change { name: "no wandering", change: |options| SplatOptions { noise: 0.0, ..options } },
-    Change { name: "one color a splat", change: |options| SplatOptions { sh_degree: 0, ..options } },
-    Change { name: "filled up to the cap", change: |options| SplatOptions { count: CountChoice::ToCap, ..options } },
-    Change {
-        name: "cameras as given",
-        change: |options| SplatOptions { cameras: CameraChoice::default(), align: CameraChoice::default(), ..options },
-    },
+    Variant { name: "black background", change: |options| SplatOptions { varied_background: 0.0, ..options } },
+    Variant { name: "opacity and size for free", change: |options| SplatOptions { cost_images: 0.0, ..options } },
+    Variant { name: "no growth", change: |options| SplatOptions { growth_frac: 0.0, ..options } },
+    Variant { name: "no wandering", change: |options| SplatOptions { noise: 0.0, ..options } },
+    Variant { name: "one color a splat", change: |options| SplatOptions { sh_degree: 0, ..options } },
+    Variant { name: "filled up to the cap", change: |options| SplatOptions { count: CountChoice::ToCap, ..options } },
+    CAMERAS_AS_GIVEN,
 ];
 
 /// Flags of `bench ablation`.
@@ -86,8 +78,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let limits = training::limits(args.seconds, args.steps, USUAL_SECONDS)?;
     let mut runs = Runs::open(&args.bench, crate::commands::open_gpu()?)?;
     let data = runs.load(&args.data, &mut HashSet::new())?;
-    let asked = |change: &&Change| args.only.is_empty() || args.only.iter().any(|word| change.name.contains(word));
-    let changes: Vec<&Change> =
+    let asked = |change: &&Variant| args.only.is_empty() || args.only.iter().any(|word| change.name.contains(word));
+    let changes: Vec<&Variant> =
         CHANGES.iter().filter(|change| is_change(change, &data.options)).filter(asked).collect();
     if changes.is_empty() {
         let names: Vec<&str> = CHANGES.iter().map(|change| change.name).collect();
@@ -106,7 +98,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             finished.push(runs.run(Job {
                 name: format!("ablation {} {} seed {seed}", data.name, change.name),
                 data: &data,
-                options: (change.change)(SplatOptions { seed, ..data.options.clone() }),
+                options: change.options(&SplatOptions { seed, ..data.options.clone() }),
                 limits,
                 disturbed: None,
                 variant: Some(change.name.to_owned()),
@@ -127,8 +119,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 /// Whether it changes anything about how these data are learned.
-fn is_change(change: &Change, options: &SplatOptions) -> bool {
-    (change.change)(options.clone()) != *options
+fn is_change(change: &Variant, options: &SplatOptions) -> bool {
+    change.options(options) != *options
 }
 
 impl Changed {

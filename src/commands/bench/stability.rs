@@ -4,6 +4,7 @@ use crate::bench::disturb::Disturbance;
 use crate::bench::page::{Findings, Table};
 use crate::bench::runs::{BenchArgs, Disturbed, Job, NamedData, Run, Runs};
 use crate::bench::statistics::{Between, break_point, extent, median};
+use crate::bench::variant::{CAMERAS_AS_GIVEN, Variant};
 use crate::chart::{Axis, Chart, Line, Point, Rule, Scale, short};
 use crate::exit::{self, BadArgument, Exit};
 use crate::session::Limits;
@@ -13,7 +14,7 @@ use serde::Serialize;
 use std::collections::HashSet;
 use std::path::PathBuf;
 use std::sync::Arc;
-use trainer::splat::{CameraChoice, SplatOptions};
+use trainer::splat::SplatOptions;
 use trainer::{Keyframe, Split};
 
 /// Length of a run where no flag says.
@@ -24,19 +25,8 @@ const NANOS_PER_SEC: f64 = 1e9;
 /// Between the stamps of images that are only counted.
 const NANOS_PER_COUNT: f64 = 1e6;
 
-/// A way to train that meets the same disturbances as the others: one line each in every chart.
-struct Variant {
-    name: &'static str,
-    change: fn(SplatOptions) -> SplatOptions,
-}
-
-const VARIANTS: &[Variant] = &[
-    Variant { name: "as settled by --refine", change: |options| options },
-    Variant {
-        name: "cameras as given",
-        change: |options| SplatOptions { cameras: CameraChoice::default(), align: CameraChoice::default(), ..options },
-    },
-];
+/// All meet the same disturbances: one line each in every chart.
+const VARIANTS: &[Variant] = &[Variant { name: "as settled by --refine", change: |options| options }, CAMERAS_AS_GIVEN];
 
 /// Flags of `bench stability`.
 #[derive(Debug, clap::Args)]
@@ -164,8 +154,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 fn told_apart(options: &SplatOptions) -> Vec<&'static Variant> {
     let mut told_apart: Vec<&Variant> = Vec::new();
     for variant in VARIANTS {
-        let changed = (variant.change)(options.clone());
-        if told_apart.iter().all(|other| (other.change)(options.clone()) != changed) {
+        let changed = variant.options(options);
+        if told_apart.iter().all(|other| other.options(options) != changed) {
             told_apart.push(variant);
         }
     }
@@ -200,7 +190,7 @@ fn measure(
         finished.push(runs.run(Job {
             name: format!("stability {} {} {size} seed {seed}", data.name, variant.name),
             data,
-            options: (variant.change)(SplatOptions { seed, ..data.options.clone() }),
+            options: variant.options(&SplatOptions { seed, ..data.options.clone() }),
             limits,
             disturbed: disturbed.clone(),
             variant: Some(variant.name.to_owned()),

@@ -1,10 +1,11 @@
 // grow_child: give each dead or new splat a parent, chosen by error, and a place within it.
 //
 // threads   one per splat up to n_after
-// reads     growth, cumulative, block_weights
+// reads     growth, weights, cumulative, block_weights
 // writes    means, rotations, shapes, sh_dc, sh_rest, all moments of the child; n_children [n_before] (cleared before), parents [n_after]
 //
-// A child is never a parent: dead splats weigh nothing and new ones have no weight, so nobody reads what is written here.
+// A child is never a parent: what weighs nothing is not taken, so nobody reads what is written here. Sums that are rounded
+// may lead to one that weighs nothing all the same, a choice or two in a million.
 
 #import view
 #import growth
@@ -24,6 +25,7 @@
 @group(0) @binding(10) var<storage, read_write> sh_rest_moments: array<f32>;
 @group(0) @binding(11) var<storage, read_write> n_children: array<atomic<u32>>;
 @group(0) @binding(12) var<storage, read_write> parents: array<u32>;
+@group(0) @binding(13) var<storage, read> weights: array<f32>;
 
 override WG_SIZE = 256u;
 @compute @workgroup_size(WG_SIZE)
@@ -50,8 +52,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         let middle = (parent + high) / 2u;
         if cumulative[middle] > within { high = middle; } else { parent = middle + 1u; }
     }
-    let parent_is_dead = is_dead(means[parent], shapes[parent], growth.least_opacity);
-    if total <= 0.0 || parent_is_dead {
+    if weights[parent] <= 0.0 {
         // Nothing to learn from yet: invisible until the next change of the count.
         if child >= growth.n_before {
             means[child] = vec4f(0.0);

@@ -33,6 +33,7 @@ pub(crate) struct Target<'a> {
 #[derive(Debug)]
 pub(crate) struct GrowthBuffers {
     pub(crate) growth: Buffer,
+    pub(crate) weights: Buffer,
     pub(crate) cumulative: Buffer,
     pub(crate) block_weights: Buffer,
     pub(crate) n_children: Buffer,
@@ -50,7 +51,8 @@ pub(crate) fn grow(
 ) {
     let blocks = |n: u32| u64::from(n.div_ceil(256));
     let uniform = ("growth", &buffers.growth);
-    let weights = ("block_weights", &buffers.block_weights);
+    let weights = ("weights", &buffers.weights);
+    let block_weights = ("block_weights", &buffers.block_weights);
     passes.clear(&buffers.n_children);
     passes.dispatch(
         gpu,
@@ -61,11 +63,12 @@ pub(crate) fn grow(
             ("means", &splats.means),
             ("shapes", &splats.shapes),
             ("error_sums", &splats.error_sums),
-            ("cumulative", &buffers.cumulative),
             weights,
+            ("cumulative", &buffers.cumulative),
+            block_weights,
         ],
     );
-    passes.dispatch(gpu, &pipelines.grow_scan, 1, &[uniform, weights]);
+    passes.dispatch(gpu, &pipelines.grow_scan, 1, &[uniform, block_weights]);
     passes.dispatch(
         gpu,
         &pipelines.grow_child,
@@ -73,8 +76,9 @@ pub(crate) fn grow(
         &[
             &[
                 uniform,
-                ("cumulative", &buffers.cumulative),
                 weights,
+                ("cumulative", &buffers.cumulative),
+                block_weights,
                 ("n_children", &buffers.n_children),
                 ("parents", &buffers.parents),
             ][..],

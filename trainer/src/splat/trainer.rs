@@ -635,6 +635,7 @@ impl SplatTrainer {
         let words = |name: &str, n: u32| self.gpu.storage(name, 4 * u64::from(n));
         let buffers = GrowthBuffers {
             growth: self.gpu.uniform_with("splat.growth", &growth),
+            weights: words("splat.weights", n_before)?,
             cumulative: words("splat.cumulative", n_before)?,
             block_weights: words("splat.block_weights", n_before.div_ceil(256))?,
             n_children: words("splat.n_children", n_before)?,

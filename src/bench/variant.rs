@@ -1,0 +1,22 @@
+//! Ways to train that are compared with each other.
+
+use trainer::splat::{CameraChoice, SplatOptions};
+
+/// One of them.
+pub(crate) struct Variant {
+    pub(crate) name: &'static str,
+    pub(crate) change: fn(SplatOptions) -> SplatOptions,
+}
+
+/// Nothing is looked for about cameras.
+pub(crate) const CAMERAS_AS_GIVEN: Variant = Variant {
+    name: "cameras as given",
+    change: |options| SplatOptions { cameras: CameraChoice::default(), align: CameraChoice::default(), ..options },
+};
+
+impl Variant {
+    /// How it trains where `usual` is asked for.
+    pub(crate) fn options(&self, usual: &SplatOptions) -> SplatOptions {
+        (self.change)(usual.clone())
+    }
+}
