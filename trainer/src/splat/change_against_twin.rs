@@ -163,6 +163,9 @@ fn growth_matches_the_twin() {
     assert_eq!(families, 204, "the dead and the new");
 
     gpu.write(&bench.splats.error_sums, 0, bytemuck::cast_slice(&errors));
+    let n_planes = 6 * growth.capacity as usize;
+    let moments: Vec<[f32; 4]> = (0..n_planes).map(|ix| [f32_of(1.0 + ix as f64); 4]).collect();
+    gpu.write(&bench.splats.moments, 0, bytemuck::cast_slice(&moments));
     let buffers = growth_buffers(&gpu, &growth);
     let mut passes = Passes::default();
     grow(&gpu, &mut passes, &bench.learn, &bench.splats, &buffers, &growth);
@@ -172,6 +175,19 @@ fn growth_matches_the_twin() {
     let expected_parents: Vec<u32> =
         expected.parents.iter().map(|parent| parent.map_or(u32::MAX, |ix| u32::try_from(ix).unwrap())).collect();
     assert_eq!(parents, expected_parents);
+    let after: Vec<[f32; 4]> = gpu.read(&bench.splats.moments, n_planes).unwrap();
+    for (ix, parent) in expected.parents.iter().enumerate() {
+        let is_parent = expected.parents.contains(&Some(ix));
+        for plane in 0..6 {
+            let at = |ix: usize| plane * growth.capacity as usize + ix;
+            let of_shape = plane >= 4;
+            let kept = match parent {
+                Some(parent) => (plane == 5).then_some(*parent),
+                None => (of_shape || !is_parent).then_some(ix),
+            };
+            assert_eq!(after[at(ix)], kept.map_or([0.0; 4], |from| moments[at(from)]), "splat {ix}, plane {plane}");
+        }
+    }
     let sums: Vec<f32> = gpu.read(&bench.splats.error_sums, N_AFTER as usize).unwrap();
     assert!(sums.iter().all(|sum| *sum == 0.0), "errors are counted anew");
     check(&splats_of(&bench.splats.read(&gpu).unwrap()), &expected.splats, [2e-5, 2e-4, 1e-6, 1e-3, 1e-6]);
