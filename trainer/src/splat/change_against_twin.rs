@@ -180,12 +180,8 @@ fn growth_matches_the_twin() {
         let is_parent = expected.parents.contains(&Some(ix));
         for plane in 0..6 {
             let at = |ix: usize| plane * growth.capacity as usize + ix;
-            let of_shape = plane >= 4;
-            let kept = match parent {
-                Some(parent) => (plane == 5).then_some(*parent),
-                None => (of_shape || !is_parent).then_some(ix),
-            };
-            assert_eq!(after[at(ix)], kept.map_or([0.0; 4], |from| moments[at(from)]), "splat {ix}, plane {plane}");
+            let kept = if is_parent || parent.is_some() { [0.0; 4] } else { moments[at(ix)] };
+            assert_eq!(after[at(ix)], kept, "splat {ix}, plane {plane}");
         }
     }
     let sums: Vec<f32> = gpu.read(&bench.splats.error_sums, N_AFTER as usize).unwrap();

@@ -69,8 +69,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     means[child] = means[parent] + vec4f(growth.child_spread * offset, 0.0);
     rotations[child] = rotations[parent];
     shapes[child] = shape;
-    for (var plane = 0u; plane < 5u; plane++) { moments[plane * growth.capacity + child] = vec4f(0.0); }
-    moments[5u * growth.capacity + child] = moments[5u * growth.capacity + parent];
+    for (var plane = 0u; plane < 6u; plane++) { moments[plane * growth.capacity + child] = vec4f(0.0); }
     for (var plane = 0u; plane < 3u; plane++) {
         sh_dc[plane * growth.capacity + child] = sh_dc[plane * growth.capacity + parent];
         sh_dc_moments[plane * growth.capacity + child] = vec2f(0.0);

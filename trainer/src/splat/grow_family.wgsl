@@ -42,7 +42,6 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     }
     let shrink = log(clamp(opacity / weight, 0.05, 1.0));
     shapes[splat_ix] = vec4f(shape.xyz + shrink, log(shared_opacity / (1.0 - shared_opacity)));
-    // Adam forgets, so a family's first steps are three times as long as usual and more: it finds its places and colors sooner.
-    // Not so for shapes: opacities that all swing at once cost half a decibel for as long as it takes to learn them again.
-    for (var plane = 0u; plane < 4u; plane++) { moments[plane * growth.capacity + splat_ix] = vec4f(0.0); }
+    // Adam forgets, so a family's first steps are three times as long as usual and more: it finds its place sooner.
+    for (var plane = 0u; plane < 6u; plane++) { moments[plane * growth.capacity + splat_ix] = vec4f(0.0); }
 }
