@@ -125,6 +125,10 @@ impl Live {
         if n_most == 0 {
             return Ok(());
         }
+        if self.is_finished() {
+            std::thread::sleep(IDLE);
+            return Ok(());
+        }
         let before = Instant::now();
         self.session.step(n_most)?;
         self.trained = before.elapsed();
@@ -196,8 +200,15 @@ impl Live {
         self.keyframes.iter().any(|keyframe| keyframe.split == Split::Train)
     }
 
+    /// Whether the model knows all there is to know; it is shown until somebody ends the run.
+    fn is_finished(&self) -> bool {
+        self.feed.ended() && self.session.is_idle()
+    }
+
     fn state(&self) -> &'static str {
-        if self.is_training() {
+        if self.is_finished() {
+            "finished"
+        } else if self.is_training() {
             "training"
         } else if self.feed.first_image().is_some() {
             "collecting keyframes"
