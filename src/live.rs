@@ -83,14 +83,14 @@ impl Live {
         let n_before = self.keyframes.len();
         match self.pace {
             Pace::RealTime => {
-                let patience = if self.is_training() { Duration::ZERO } else { IDLE };
+                let patience = if self.is_training() && !self.session.is_idle() { Duration::ZERO } else { IDLE };
                 while let Some(change) = self.feed.next(patience) {
                     self.apply(change)?;
                 }
             }
             Pace::Lockstep { steps_per_keyframe } => {
                 let step = self.session.progress().step;
-                while !self.feed.ended() && step >= self.next_keyframe_at {
+                while !self.feed.ended() && (step >= self.next_keyframe_at || self.session.is_idle()) {
                     let Some(change) = self.feed.next(IDLE) else { break };
                     let is_new = matches!(change, Change::Accepted(_));
                     self.apply(change)?;
@@ -123,6 +123,10 @@ impl Live {
             Pace::Lockstep { .. } => self.next_keyframe_at.saturating_sub(self.session.progress().step),
         };
         if n_most == 0 {
+            return Ok(());
+        }
+        if self.is_finished() {
+            std::thread::sleep(IDLE);
             return Ok(());
         }
         let before = Instant::now();
@@ -196,8 +200,15 @@ impl Live {
         self.keyframes.iter().any(|keyframe| keyframe.split == Split::Train)
     }
 
+    /// Whether the model knows all there is to know; it is shown until somebody ends the run.
+    fn is_finished(&self) -> bool {
+        self.feed.ended() && self.session.is_idle()
+    }
+
     fn state(&self) -> &'static str {
-        if self.is_training() {
+        if self.is_finished() {
+            "finished"
+        } else if self.is_training() {
             "training"
         } else if self.feed.first_image().is_some() {
             "collecting keyframes"

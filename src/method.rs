@@ -8,6 +8,7 @@ use std::sync::Arc;
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
 use trainer::splat::{SplatOptions, SplatTrainer};
+use trainer::tsdf::{TsdfModel, TsdfOptions};
 use trainer::{Keyframe, Method};
 
 /// The scene models there are.
@@ -15,13 +16,15 @@ use trainer::{Keyframe, Method};
 pub(crate) enum Kind {
     /// 3D Gaussians.
     Splat,
+    /// A distance field with a mesh, from depth.
+    Tsdf,
 }
 
 impl Kind {
     /// The kind that a rig file names.
     pub(crate) fn of_rig(rig: &Rig) -> Result<Self, BadArgument> {
         let name = &rig.train.method;
-        Self::named(name).ok_or_else(|| BadArgument(format!("train.method = {name:?}: must be \"splat\"")))
+        Self::named(name).ok_or_else(|| BadArgument(format!("train.method = {name:?}: must be \"splat\" or \"tsdf\"")))
     }
 
     /// The kind of a name.
@@ -33,13 +36,19 @@ impl Kind {
     pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Splat => "splat",
+            Self::Tsdf => "tsdf",
         }
     }
 
-    /// A model that has seen nothing yet.
+    /// A model that has seen nothing yet. Of the options a distance field has the memory it may take; what else it wants
+    /// to know it finds in the depth.
     pub(crate) fn start(self, gpu: Arc<Gpu>, options: SplatOptions) -> anyhow::Result<Box<dyn Method>> {
         match self {
             Self::Splat => Ok(Box::new(SplatTrainer::new(gpu, options)?)),
+            Self::Tsdf => {
+                let options = TsdfOptions { max_bytes: options.max_bytes, ..TsdfOptions::default() };
+                Ok(Box::new(TsdfModel::new(gpu, options)?))
+            }
         }
     }
 }
@@ -56,13 +65,21 @@ pub(crate) struct Resumed {
 
 /// Goes on from a checkpoint; what was learned from must be among the keyframes.
 pub(crate) fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<Resumed> {
+    if checkpoint.method == Kind::Tsdf.name() {
+        let (model, rest) = TsdfModel::resume(gpu, checkpoint, keyframes)?;
+        let options = SplatOptions { max_bytes: model.options().max_bytes, ..SplatOptions::default() };
+        return Ok(Resumed { kind: Kind::Tsdf, method: Box::new(model), options, rest });
+    }
     let (model, rest) = SplatTrainer::resume(gpu, checkpoint, keyframes)?;
     let options = model.options().clone();
     Ok(Resumed { kind: Kind::Splat, method: Box::new(model), options, rest })
 }
 
-/// A saved model: its folder, or a file of splats.
+/// A saved model: its folder, of either kind, or a file of splats.
 pub(crate) fn load(gpu: Arc<Gpu>, model: &Path) -> anyhow::Result<Box<dyn Method>> {
+    if TsdfModel::is_saved_in(model) {
+        return Ok(Box::new(TsdfModel::load(gpu, model)?));
+    }
     let splats = splat_file::read(model)?;
     let model = if model.is_dir() { Some(model) } else { None };
     let trainer = SplatTrainer::from_arrays(gpu, SplatOptions::default(), &splats)?;

@@ -10,7 +10,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use trainer::{Keyframe, Method};
 
 /// The files of a saved model: what `checkpoint_sha256` covers, in this order.
-const MODEL_FILES: [&str; 2] = ["model.json", "splats.ply"];
+const MODEL_FILES: [&str; 5] = ["model.json", "mesh.ply", "mesh.glb", "field.blocks", "splats.ply"];
 /// Where a model lies until it is whole.
 const UNFINISHED: &str = "model.part";
 /// Held while a run writes into a folder.
@@ -81,7 +81,7 @@ fn lock(folder: &Path) -> anyhow::Result<()> {
 pub(crate) fn save_model(method: &mut dyn Method, folder: &Path) -> anyhow::Result<()> {
     let unfinished = folder.join(UNFINISHED);
     method.save(&unfinished)?;
-    // The splats come last: a folder that holds them holds the whole model.
+    // Splats and blocks come last: a folder that holds them holds the whole model.
     for name in MODEL_FILES.iter().filter(|name| unfinished.join(name).exists()) {
         let place = folder.join(name);
         std::fs::rename(unfinished.join(name), &place).with_context(|| format!("cannot write {}", place.display()))?;

@@ -289,6 +289,11 @@ impl Session {
             || self.limits.steps.is_some_and(|steps| self.method.progress().step >= steps)
     }
 
+    /// Whether more steps would do nothing until a keyframe comes.
+    pub(crate) fn is_idle(&self) -> bool {
+        self.method.is_idle()
+    }
+
     /// Trains a slice of at most `n_most` steps, and evaluates when a mark was reached.
     pub(crate) fn step(&mut self, n_most: u64) -> anyhow::Result<u64> {
         let left = self.limits.steps.map_or(u64::MAX, |steps| steps.saturating_sub(self.method.progress().step));
@@ -399,7 +404,7 @@ impl Session {
         print::line(format_args!(
             "{seconds:.1} s, {}, {}, {:.1} MB: {}",
             print::counted(done.steps, "step"),
-            print::counted(done.primitives, "splat"),
+            print::counted(done.primitives, self.method.primitive()),
             done.bytes as f64 / 1e6,
             done.scores
         ))?;

@@ -37,7 +37,7 @@ pub(crate) fn drive(mut session: Session, keyframes: &[Arc<Keyframe>], stop: &St
     for keyframe in keyframes {
         session.push(keyframe)?;
     }
-    while !stop.asked() && !session.is_over() {
+    while !stop.asked() && !session.is_over() && !session.is_idle() {
         session.step(u64::MAX)?;
     }
     Ok(session)

@@ -99,6 +99,45 @@ fn a_simulated_run_learns_and_its_recording_gives_the_same_bits() {
     tells_what_a_cut_off_recording_lost(folder);
 }
 
+/// Keyframes that are fused.
+const N_FUSED: &str = "10";
+/// Measured 18 dB: what was not seen yet has no surface.
+const LEAST_PSNR_OF_MESH: f64 = 15.0;
+
+#[test]
+fn a_distance_field_is_built_live_replayed_scored_drawn_and_gone_on_with() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    rig_file(folder);
+    let common = ["--method", "tsdf", "--json", "--steps", N_FUSED];
+    let run = [&["--steps-per-keyframe", "1", "--listen", "127.0.0.1:0"], &common[..]].concat();
+    let live = ["run", "rig.toml", "--sim", "--record", "scan.mcap", "--out", "live"];
+    let told = events(folder, &[&live[..], &run].concat());
+    let done = told.last().expect("events");
+    let psnr = number(done, "psnr");
+    assert!(psnr >= LEAST_PSNR_OF_MESH, "test PSNR {psnr:.2} dB");
+    assert!(number(done, "depth_rmse_m") < 0.05, "{done}");
+
+    let replay = ["run", "rig.toml", "--from", "scan.mcap", "--out", "replay"];
+    let replayed = events(folder, &[&replay[..], &run].concat());
+    assert_eq!(replayed.last().expect("events")["checkpoint_sha256"], done["checkpoint_sha256"]);
+    let mesh = std::fs::read(folder.join("live/mesh.glb")).expect("a mesh");
+    assert!(mesh.starts_with(b"glTF") && mesh.len() > 50_000, "{} bytes", mesh.len());
+
+    scores_a_saved_model_alike(folder, psnr);
+    draws_a_saved_model(folder);
+
+    let train = ["train", "scan.mcap", "--keyframes", "live/keyframes.txt"];
+    let half = ["--method", "tsdf", "--json", "--steps", "4", "--out", "half"];
+    let half = events(folder, &[&train[..], &half].concat());
+    let rest = ["--resume", "half", "--json", "--steps", N_FUSED, "--out", "whole"];
+    let whole = events(folder, &[&train[..], &rest].concat());
+    let [half, whole] = [half, whole].map(|told| told.last().cloned().expect("events"));
+    assert_eq!(half["steps"], 4);
+    assert!(number(&half, "psnr") < psnr);
+    assert_eq!(whole["checkpoint_sha256"], done["checkpoint_sha256"], "two halves give another model");
+}
+
 /// What `run` said of its model, `eval` says of the saved one.
 fn scores_a_saved_model_alike(folder: &Path, psnr: f64) {
     /// The file keeps the parameters' bits; scores are sums in the same order.

@@ -20,6 +20,8 @@ pub mod spz;
 #[cfg(test)]
 mod test_data;
 
+pub mod tsdf;
+
 pub use error::Error;
 pub use keyframe::{DepthMap, Keyframe, Split, Truth};
 pub use method::{Method, Part, Progress};

@@ -50,6 +50,10 @@ pub trait Method {
     /// A queued update is lost, and done again later, when it turns out that a buffer was too small. When all `n` were
     /// queued the call waits for them, so that [`Method::progress`] is exact; loop until it has reached the step you want.
     fn step(&mut self, n: u64) -> Result<u64, Error>;
+    /// Whether more steps would do nothing until a keyframe comes.
+    fn is_idle(&self) -> bool;
+    /// What [`Progress::primitives`] counts, in the singular.
+    fn primitive(&self) -> &'static str;
     /// Waits for what is queued, and says how many updates were made in all, those included that a trial took back: unlike
     /// [`Progress::step`] it never goes back.
     fn n_taken(&mut self) -> Result<u64, Error>;

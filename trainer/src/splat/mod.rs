@@ -11,7 +11,7 @@ mod camera_terms;
 #[cfg(test)]
 mod change_against_twin;
 pub mod cloud;
-mod equirect;
+pub(crate) mod equirect;
 pub mod kernels;
 #[cfg(test)]
 mod learning;
@@ -31,5 +31,6 @@ mod views;
 pub use camera_terms::{CameraFix, PosedLens, TermSet};
 pub(crate) use camera_terms::{drift_share, moved, shares_lens};
 pub use options::SplatOptions;
+pub(crate) use params::{Camera, LOW_PASS_PX2, View};
 pub use trainer::SplatTrainer;
 pub use trials::{CameraChoice, Candidate, CountChoice, Trial};

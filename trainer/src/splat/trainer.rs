@@ -848,6 +848,14 @@ impl Method for SplatTrainer {
         Ok(n)
     }
 
+    fn is_idle(&self) -> bool {
+        false // There is always something to learn, or it is not known yet that there is not.
+    }
+
+    fn primitive(&self) -> &'static str {
+        "splat"
+    }
+
     fn n_taken(&mut self) -> Result<u64, Error> {
         self.settle()?;
         Ok(self.step.wrapping_add(self.n_taken_back))

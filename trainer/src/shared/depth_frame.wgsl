@@ -1,0 +1,43 @@
+// depth_frame: one depth image, the color image that goes with it, and where both cameras were.
+
+struct DepthFrame {
+    depth_row_0: vec4f,       // depth_from_field, upper three rows
+    depth_row_1: vec4f,
+    depth_row_2: vec4f,
+    field_row_0: vec4f,       // field_from_depth
+    field_row_1: vec4f,
+    field_row_2: vec4f,
+    color_row_0: vec4f,       // color_from_field
+    color_row_1: vec4f,
+    color_row_2: vec4f,
+    depth_focal_px: vec2f,
+    depth_principal_px: vec2f,
+    color_focal_px: vec2f,
+    color_principal_px: vec2f,
+    depth_size_px: vec2u,
+    color_size_px: vec2u,
+}
+
+fn depth_from_field(frame: DepthFrame, point: vec3f) -> vec3f {
+    let p = vec4f(point, 1.0);
+    return vec3f(dot(frame.depth_row_0, p), dot(frame.depth_row_1, p), dot(frame.depth_row_2, p));
+}
+
+fn field_from_depth(frame: DepthFrame, point: vec3f) -> vec3f {
+    let p = vec4f(point, 1.0);
+    return vec3f(dot(frame.field_row_0, p), dot(frame.field_row_1, p), dot(frame.field_row_2, p));
+}
+
+fn color_from_field(frame: DepthFrame, point: vec3f) -> vec3f {
+    let p = vec4f(point, 1.0);
+    return vec3f(dot(frame.color_row_0, p), dot(frame.color_row_1, p), dot(frame.color_row_2, p));
+}
+
+// Point on the ray of a place in the depth image whose z is 1.
+fn ray_of(frame: DepthFrame, place_px: vec2f) -> vec3f {
+    return vec3f((place_px - frame.depth_principal_px) / frame.depth_focal_px, 1.0);
+}
+
+fn folded(wg: vec3u, n_wgs: vec3u) -> u32 {
+    return wg.y * n_wgs.x + wg.x;
+}

@@ -1,0 +1,60 @@
+// field: a signed distance field in blocks of 8x8x8 voxels, and how a voxel's words are read.
+//
+// Coordinates of the field are metres from its anchor, along the world's axes. Voxel i covers [i, i + 1) voxel_m, its
+// center lies at i + 0.5. A chunk is 8x8x8 blocks; `keys` is a hash table of chunks with open addressing, and row h of
+// `entries` tells, for the chunk at place h of that table, the slot of each of its blocks plus one, 0 where there is none.
+//
+// source    Niessner et al. 2013 (voxel hashing); Oleynikova et al. 2017 (Voxblox); chunks of blocks are ours: a ray
+//           crosses empty ones in one step, and one word is enough for a key
+
+struct Field {
+    voxel_m: f32,
+    truncation_m: f32,        // least
+    scale_m: f32,             // most truncation; also the distance that the largest stored number stands for
+    noise_per_m2: f32,        // standard deviation of depth at 1 m; it grows with the square
+    max_depth_m: f32,
+    max_weight: u32,          // in 256ths
+    n_chunk_slots: u32,       // a power of two
+    n_block_slots: u32,
+}
+
+const BLOCK_VOXELS = 512u;
+const NO_BLOCK = 0u;
+const BLOCK_WANTED = 0xffffffffu; // Taken note of where the pool was full.
+const WEIGHT_ONE = 256.0;
+const MAX_PROBES = 128u;
+const CHUNK_LIMIT = vec3i(1023, 1023, 511);
+
+// Distance along the surface's normal up to which a reading of this depth says something, metres.
+fn truncation_at(field: Field, depth_m: f32) -> f32 {
+    return clamp(3.0 * field.noise_per_m2 * depth_m * depth_m, field.truncation_m, field.scale_m);
+}
+
+fn stored_distance(word: u32) -> f32 {
+    return f32(bitcast<i32>(word << 16u) >> 16u) / 32767.0;
+}
+
+fn stored_weight(word: u32) -> u32 {
+    return word >> 16u;
+}
+
+fn voxel_in_block(voxel: vec3i) -> u32 {
+    let local = vec3u(voxel & vec3i(7));
+    return local.z * 64u + local.y * 8u + local.x;
+}
+
+// Whether the chunk can have a key.
+fn chunk_in_range(chunk: vec3i) -> bool {
+    return all(chunk >= -CHUNK_LIMIT) && all(chunk < CHUNK_LIMIT);
+}
+
+// Never 0: that is an empty place.
+fn key_of(chunk: vec3i) -> u32 {
+    let at = vec3u(chunk + CHUNK_LIMIT + 1);
+    return ~((at.x << 21u) | (at.y << 10u) | at.z);
+}
+
+fn hash_of(key: u32) -> u32 {
+    let mixed = key * 0x9e3779b1u;
+    return mixed ^ (mixed >> 15u);
+}

@@ -1,0 +1,253 @@
+//! The field's memory: a pool of blocks, and the table that finds them.
+
+use super::block::{Block, Blocks, N_VOXELS, Place};
+use super::chosen::Lattice;
+use super::kernels::Pipelines;
+use super::params::{Field, status};
+use super::passes;
+use crate::Error;
+use crate::gpu::{Buffer, Gpu, Passes};
+use std::collections::BTreeSet;
+
+/// Bytes of a block on the GPU: distances, colors, its place, and whether it changed or is seen.
+pub(crate) const BYTES_PER_BLOCK: u64 = 512 * (4 + 8) + 16 + 4 + 4;
+/// Bytes of a chunk: a key and the slots of its blocks.
+const BYTES_PER_CHUNK: u64 = 4 + 4 * 512;
+/// Blocks gathered at once.
+const GATHERED: usize = 2048;
+
+/// Sizes of the pool and the table.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Capacity {
+    pub(crate) n_blocks: u32,
+    /// A power of two.
+    pub(crate) n_chunks: u32,
+}
+
+/// What the kernels work on.
+#[derive(Debug)]
+pub(crate) struct FieldBuffers {
+    pub(crate) capacity: Capacity,
+    pub(crate) field: Buffer,
+    pub(crate) status: Buffer,
+    pub(crate) keys: Buffer,
+    pub(crate) entries: Buffer,
+    pub(crate) coords: Buffer,
+    pub(crate) geometry: Buffer,
+    pub(crate) colors: Buffer,
+    pub(crate) changed: Buffer,
+    pub(crate) visible: Buffer,
+}
+
+/// Most blocks that the adapter can bind.
+pub(crate) fn most_blocks(gpu: &Gpu) -> u32 {
+    u32::try_from(gpu.max_binding_bytes() / (8 * N_VOXELS as u64)).unwrap_or(u32::MAX).max(1)
+}
+
+impl FieldBuffers {
+    /// An empty field.
+    pub(crate) fn new(gpu: &Gpu, lattice: &Lattice, capacity: Capacity) -> Result<Self, Error> {
+        let n = u64::from(capacity.n_blocks);
+        let field = Field::new(lattice, capacity.n_chunks, capacity.n_blocks);
+        Ok(Self {
+            capacity,
+            field: gpu.uniform_with("tsdf.field", &field),
+            status: gpu.storage("tsdf.status", 4 * status::LEN as u64)?,
+            keys: gpu.storage("tsdf.keys", 4 * u64::from(capacity.n_chunks))?,
+            entries: gpu.storage("tsdf.entries", 4 * 512 * u64::from(capacity.n_chunks))?,
+            coords: gpu.storage("tsdf.coords", 16 * n)?,
+            geometry: gpu.storage("tsdf.geometry", 4 * 512 * n)?,
+            colors: gpu.storage("tsdf.colors", 8 * 512 * n)?,
+            changed: gpu.storage("tsdf.changed", 4 * n)?,
+            visible: gpu.storage("tsdf.visible", 4 * n)?,
+        })
+    }
+
+    /// Bytes that `n_blocks` blocks take, with the table.
+    pub(crate) fn bytes(&self, n_blocks: u64) -> u64 {
+        n_blocks * BYTES_PER_BLOCK + u64::from(self.capacity.n_chunks) * BYTES_PER_CHUNK
+    }
+
+    pub(crate) fn counters(&self, gpu: &Gpu) -> Result<Vec<u32>, Error> {
+        gpu.read(&self.status, status::LEN)
+    }
+
+    /// Blocks that have a slot.
+    pub(crate) fn n_blocks(&self, gpu: &Gpu) -> Result<u32, Error> {
+        Ok(self.counters(gpu)?[status::N_BLOCKS].min(self.capacity.n_blocks))
+    }
+
+    /// The same blocks with other sizes; what was asked for and found no room is forgotten, frames can be fused again.
+    pub(crate) fn resized(
+        &self,
+        gpu: &Gpu,
+        pipelines: &Pipelines,
+        lattice: &Lattice,
+        mut capacity: Capacity,
+    ) -> Result<Self, Error> {
+        let n = self.n_blocks(gpu)?;
+        let mut counters = self.counters(gpu)?;
+        loop {
+            let resized = Self::new(gpu, lattice, capacity)?;
+            for (from, to, bytes) in [
+                (&self.coords, &resized.coords, 16),
+                (&self.geometry, &resized.geometry, 4 * 512),
+                (&self.colors, &resized.colors, 8 * 512),
+                (&self.changed, &resized.changed, 4),
+            ] {
+                if n > 0 {
+                    gpu.copy((from, 0), (to, 0), bytes * u64::from(n));
+                }
+            }
+            counters[status::N_BLOCKS] = n;
+            forget_failure(&mut counters);
+            gpu.write(&resized.status, 0, bytemuck::cast_slice(&counters));
+            if resized.index(gpu, pipelines, n)? {
+                return Ok(resized);
+            }
+            capacity.n_chunks *= 2;
+        }
+    }
+
+    /// Enters `n` blocks into the empty table; false where it is too small.
+    fn index(&self, gpu: &Gpu, pipelines: &Pipelines, n: u32) -> Result<bool, Error> {
+        let mut list = Passes::default();
+        passes::index(gpu, &mut list, pipelines, self, n);
+        list.submit(gpu);
+        Ok(self.counters(gpu)?[status::FAILED] == 0)
+    }
+
+    /// A field of given blocks.
+    pub(crate) fn with_blocks(
+        gpu: &Gpu,
+        pipelines: &Pipelines,
+        lattice: &Lattice,
+        blocks: &Blocks,
+        mut capacity: Capacity,
+    ) -> Result<Self, Error> {
+        let n = u32::try_from(blocks.len()).unwrap_or(u32::MAX);
+        capacity.n_blocks = capacity.n_blocks.max(n);
+        loop {
+            let field = Self::new(gpu, lattice, capacity)?;
+            for (slot, (place, block)) in (0..).zip(blocks) {
+                field.write_block(gpu, slot, *place, block);
+            }
+            gpu.write(&field.status, 0, bytemuck::bytes_of(&n));
+            if field.index(gpu, pipelines, n)? {
+                return Ok(field);
+            }
+            capacity.n_chunks *= 2;
+        }
+    }
+
+    fn write_block(&self, gpu: &Gpu, slot: u64, place: Place, block: &Block) {
+        let [x, y, z] = place;
+        gpu.write(&self.coords, 16 * slot, bytemuck::cast_slice(&[x, y, z, 0]));
+        gpu.write(&self.geometry, 4 * 512 * slot, bytemuck::cast_slice(&block.geometry));
+        gpu.write(&self.colors, 8 * 512 * slot, bytemuck::cast_slice(&block.colors));
+    }
+
+    /// Places of the blocks, by slot.
+    pub(crate) fn places(&self, gpu: &Gpu) -> Result<Vec<Place>, Error> {
+        let n = self.n_blocks(gpu)? as usize;
+        let coords: Vec<[i32; 4]> = gpu.read(&self.coords, n)?;
+        Ok(coords.into_iter().map(|[x, y, z, _]| [x, y, z]).collect())
+    }
+
+    /// The blocks of some slots.
+    pub(crate) fn read(&self, gpu: &Gpu, pipelines: &Pipelines, slots: &[u32]) -> Result<Vec<Block>, Error> {
+        let mut blocks = Vec::with_capacity(slots.len());
+        for part in slots.chunks(GATHERED) {
+            let n = part.len();
+            let listed = gpu.storage_with("tsdf.listed", bytemuck::cast_slice(part))?;
+            let geometry = gpu.storage("tsdf.gathered_geometry", (4 * N_VOXELS * n) as u64)?;
+            let colors = gpu.storage("tsdf.gathered_colors", (8 * N_VOXELS * n) as u64)?;
+            let mut list = Passes::default();
+            passes::gather(gpu, &mut list, pipelines, self, &listed, (&geometry, &colors), n);
+            list.submit(gpu);
+            let geometry: Vec<u32> = gpu.read(&geometry, N_VOXELS * n)?;
+            let colors: Vec<[u32; 2]> = gpu.read(&colors, N_VOXELS * n)?;
+            blocks.extend(
+                geometry
+                    .chunks_exact(N_VOXELS)
+                    .zip(colors.chunks_exact(N_VOXELS))
+                    .map(|(geometry, colors)| Block { geometry: geometry.to_vec(), colors: colors.to_vec() }),
+            );
+        }
+        Ok(blocks)
+    }
+
+    /// All blocks.
+    pub(crate) fn read_all(&self, gpu: &Gpu, pipelines: &Pipelines) -> Result<Blocks, Error> {
+        let places = self.places(gpu)?;
+        let slots: Vec<u32> = (0..).take(places.len()).collect();
+        Ok(places.into_iter().zip(self.read(gpu, pipelines, &slots)?).collect())
+    }
+
+    /// Places of the blocks that changed since the last call.
+    pub(crate) fn take_changed(&self, gpu: &Gpu) -> Result<Vec<Place>, Error> {
+        let places = self.places(gpu)?;
+        let changed: Vec<u32> = gpu.read(&self.changed, places.len())?;
+        gpu.clear(&self.changed, 0, self.changed.bytes());
+        Ok(places.into_iter().zip(changed).filter(|(_, flag)| *flag != 0).map(|(place, _)| place).collect())
+    }
+
+    /// Takes the blocks of `leaving` (slots, in order) out of the pool and puts `coming` in, which must
+    /// fit. Nothing may be in flight, and no changes untold.
+    pub(crate) fn exchange(
+        &mut self,
+        gpu: &Gpu,
+        pipelines: &Pipelines,
+        leaving: &[u32],
+        coming: &Blocks,
+    ) -> Result<(), Error> {
+        let n_before = self.n_blocks(gpu)?;
+        let places = self.places(gpu)?;
+        let n_after = n_before as usize - leaving.len() + coming.len();
+        let gone: BTreeSet<u32> = leaving.iter().copied().collect();
+        // What lies past the new end moves into the holes; then those that come fill the rest.
+        let end = u32::try_from(n_after).unwrap_or(u32::MAX);
+        let movers: Vec<u32> = (end.min(n_before)..n_before).filter(|slot| !gone.contains(slot)).collect();
+        let moved = self.read(gpu, pipelines, &movers)?;
+        let moved = movers.iter().map(|slot| places[*slot as usize]).zip(moved);
+        let holes = gone.iter().copied().filter(|slot| *slot < end).chain(n_before..end);
+        let incoming =
+            moved.collect::<Vec<_>>().into_iter().chain(coming.iter().map(|(place, block)| (*place, block.clone())));
+        for (slot, (place, block)) in holes.zip(incoming) {
+            self.write_block(gpu, slot.into(), place, &block);
+        }
+        if end < n_before {
+            let (from, n) = (u64::from(end), u64::from(n_before - end));
+            gpu.clear(&self.geometry, 4 * 512 * from, 4 * 512 * n);
+            gpu.clear(&self.colors, 8 * 512 * from, 8 * 512 * n);
+        }
+        self.set_n(gpu, pipelines, end)
+    }
+
+    /// Says that the first `n` slots hold blocks, and enters them into an emptied table.
+    fn set_n(&mut self, gpu: &Gpu, pipelines: &Pipelines, n: u32) -> Result<(), Error> {
+        gpu.clear(&self.keys, 0, self.keys.bytes());
+        gpu.clear(&self.entries, 0, self.entries.bytes());
+        let mut counters = self.counters(gpu)?;
+        counters[status::N_BLOCKS] = n;
+        forget_failure(&mut counters);
+        gpu.write(&self.status, 0, bytemuck::cast_slice(&counters));
+        // There were as many chunks before, or more; only a clash of their places could fill the table up.
+        if self.index(gpu, pipelines, n)? {
+            return Ok(());
+        }
+        Err(Error::BufferTooLarge {
+            label: "tsdf.keys".to_owned(),
+            bytes: self.keys.bytes(),
+            limit_bytes: self.keys.bytes(),
+        })
+    }
+}
+
+/// Clears what a failed frame left, bounds and the number of chunks: they are counted anew.
+fn forget_failure(counters: &mut [u32]) {
+    for ix in [status::FAILED, status::TABLE_FULL, status::STOPPED] {
+        counters[ix] = 0;
+    }
+    counters[status::BOUNDS..status::STOPPED].fill(0);
+}

@@ -1,0 +1,263 @@
+// cast_rays: a picture of the field: the first surface along each pixel's ray that faces the camera.
+//
+// threads   one per pixel, in squares of 8x8
+// reads     view (in the field's frame), field, backdrop, status (bounds), keys, entries, geometry, colors
+// writes    pixels [n_pixels] (rgba8; a: 255 where there is a surface), depths [n_pixels] (metres along z; 0 where nothing is)
+// twin      tsdf/reference/cast.rs
+// source    sphere tracing: Hart 1996; in truncated fields: Newcombe et al. 2011, section 3.3; the shutter's motion to
+//           first order, as in `projection`
+
+#import view
+#import field
+#import field_status
+
+struct Backdrop {
+    srgb: vec4f,
+}
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<uniform> field: Field;
+@group(0) @binding(2) var<uniform> backdrop: Backdrop;
+@group(0) @binding(3) var<storage, read> status: array<u32>;
+@group(0) @binding(4) var<storage, read> keys: array<u32>;
+@group(0) @binding(5) var<storage, read> entries: array<u32>;
+@group(0) @binding(6) var<storage, read> geometry: array<u32>;
+@group(0) @binding(7) var<storage, read> colors: array<vec2u>;
+@group(0) @binding(8) var<storage, read_write> pixels: array<u32>;
+@group(0) @binding(9) var<storage, read_write> depths: array<f32>;
+
+const MAX_STEPS = 4096u;
+const N_REFINE = 8u;
+const CLOSE = 1e-3;           // voxels
+const UNKNOWN = 1e9;
+
+// Of the chunk and block looked up last.
+var<private> known_chunk: vec3i;
+var<private> known_row: u32;
+var<private> known_block: vec3i;
+var<private> known_slot: u32;
+
+// The row plus one; 0 where there is none.
+fn row_of(chunk: vec3i) -> u32 {
+    if all(chunk == known_chunk) { return known_row; }
+    known_chunk = chunk;
+    known_row = 0u;
+    if !chunk_in_range(chunk) { return 0u; }
+    let key = key_of(chunk);
+    var at = hash_of(key) & (field.n_chunk_slots - 1u);
+    for (var probe = 0u; probe < MAX_PROBES; probe++) {
+        let there = keys[at];
+        if there == key { known_row = at + 1u; }
+        if there == key || there == 0u { break; }
+        at = (at + 1u) & (field.n_chunk_slots - 1u);
+    }
+    return known_row;
+}
+
+// The slot plus one; 0 where there is none.
+fn slot_of(block: vec3i) -> u32 {
+    if all(block == known_block) { return known_slot; }
+    known_block = block;
+    known_slot = 0u;
+    let row = row_of(block >> vec3u(3u));
+    if row != 0u { known_slot = entries[(row - 1u) * BLOCK_VOXELS + voxel_in_block(block)]; }
+    return known_slot;
+}
+
+// Place of a voxel in the pool plus one; 0 where it has none.
+fn place_of(voxel: vec3i) -> u32 {
+    let slot = slot_of(voxel >> vec3u(3u));
+    if slot == 0u { return 0u; }
+    return (slot - 1u) * BLOCK_VOXELS + voxel_in_block(voxel) + 1u;
+}
+
+// Distance in voxels between eight voxels' centers, or UNKNOWN where one of them was not seen.
+fn distance_at(point: vec3f) -> f32 {
+    let corner = floor(point - 0.5);
+    let share = point - 0.5 - corner;
+    let voxel = vec3i(corner);
+    let is_inside = all((voxel & vec3i(7)) < vec3i(7)); // All eight in one block.
+    var at = 0u;
+    if is_inside {
+        at = place_of(voxel);
+        if at == 0u { return UNKNOWN; }
+    }
+    var sum = 0.0;
+    for (var i = 0u; i < 8u; i++) {
+        let offset = vec3u(i & 1u, (i >> 1u) & 1u, i >> 2u);
+        var place = at + offset.x + 8u * offset.y + 64u * offset.z;
+        if !is_inside {
+            place = place_of(voxel + vec3i(offset));
+            if place == 0u { return UNKNOWN; }
+        }
+        let word = geometry[place - 1u];
+        if stored_weight(word) == 0u { return UNKNOWN; }
+        let part = select(1.0 - share, share, offset == vec3u(1u));
+        sum += part.x * part.y * part.z * stored_distance(word);
+    }
+    return sum * field.scale_m / field.voxel_m;
+}
+
+// Color between the centers of those of eight voxels that have one; grey where none has.
+fn color_at(point: vec3f) -> vec3f {
+    let corner = floor(point - 0.5);
+    let share = point - 0.5 - corner;
+    var sum = vec4f(0.0);
+    for (var i = 0; i < 8; i++) {
+        let offset = vec3i(i & 1, (i >> 1u) & 1, i >> 2u);
+        let place = place_of(vec3i(corner) + offset);
+        if place == 0u { continue; }
+        let word = colors[place - 1u];
+        if (word.y >> 16u) == 0u { continue; }
+        let part = select(1.0 - share, share, offset == vec3i(1));
+        let rgb = vec3f(vec3u(word.x & 0xffffu, word.x >> 16u, word.y & 0xffffu)) / 65535.0;
+        sum += part.x * part.y * part.z * vec4f(rgb, 1.0);
+    }
+    return select(vec3f(0.5), sum.rgb / max(sum.a, 1e-6), sum.a > 1e-6);
+}
+
+struct Ray {
+    origin: vec3f,            // voxels
+    along: vec3f,             // voxels per metre of depth
+    begin_m: f32,
+    end_m: f32,
+}
+
+// The part of `ray` between two corners of a box, given in the same frame as its origin and direction.
+fn clipped(range: vec2f, origin: vec3f, along: vec3f, low: vec3f, high: vec3f) -> vec2f {
+    let safe = select(along, vec3f(1e-12), abs(along) < vec3f(1e-12));
+    let a = (low - origin) / safe;
+    let b = (high - origin) / safe;
+    let enter = min(a, b);
+    let leave = max(a, b);
+    return vec2f(max(range.x, max(enter.x, max(enter.y, enter.z))), min(range.y, min(leave.x, min(leave.y, leave.z))));
+}
+
+fn rotated_back(v: vec3f) -> vec3f { // From camera to field.
+    return view.camera_row_0.xyz * v.x + view.camera_row_1.xyz * v.y + view.camera_row_2.xyz * v.z;
+}
+
+fn ray_of(pixel: vec2u) -> Ray {
+    let place_px = vec2f(pixel) + 0.5;
+    let tau = place_px.y / f32(view.size_px.y) - 0.5;
+    let direction = vec3f((place_px - view.principal_px) / view.focal_px, 1.0);
+    // A point moves by -tau (v + w x p) in the camera; the ray undoes that.
+    let turned = direction + tau * cross(view.shutter_angular.xyz, direction);
+    let origin_m = view.center_in_world.xyz + rotated_back(tau * view.shutter_linear.xyz);
+    let along_m = rotated_back(turned);
+    var range = vec2f(view.shutter_linear.w, view.shutter_angular.w);
+    if view.crop_min.w != 0.0 {
+        let o = vec4f(origin_m, 1.0);
+        let d = vec4f(along_m, 0.0);
+        let origin = vec3f(dot(view.crop_row_0, o), dot(view.crop_row_1, o), dot(view.crop_row_2, o));
+        let along = vec3f(dot(view.crop_row_0, d), dot(view.crop_row_1, d), dot(view.crop_row_2, d));
+        range = clipped(range, origin, along, view.crop_min.xyz, view.crop_max.xyz);
+    }
+    var low = vec3f(0.0);
+    var high = vec3f(0.0);
+    for (var axis = 0u; axis < 3u; axis++) {
+        low[axis] = f32(BOUNDS_BIAS - i32(status[BOUNDS_LOW + axis])) * 64.0;
+        high[axis] = f32(i32(status[BOUNDS_HIGH + axis]) - BOUNDS_BIAS + 1) * 64.0;
+    }
+    let origin = origin_m / field.voxel_m;
+    let along = along_m / field.voxel_m;
+    range = clipped(range, origin, along, low, high);
+    return Ray(origin, along, range.x, range.y);
+}
+
+// Depth at which the ray leaves the box of `size` voxels that begins at `corner`.
+fn leaves(ray: Ray, corner: vec3i, size: i32) -> f32 {
+    return clipped(vec2f(0.0, 1e30), ray.origin, ray.along, vec3f(corner), vec3f(corner + size)).y;
+}
+
+// Depth of the crossing between a place outside and one inside; UNKNOWN where what lies between was not seen.
+fn crossing(ray: Ray, outside_m: f32, inside_m: f32, outside_distance: f32, inside_distance: f32, speed: f32) -> f32 {
+    var low = vec2f(outside_m, outside_distance);
+    var high = vec2f(inside_m, inside_distance);
+    var at_m = inside_m;
+    for (var i = 0u; i < N_REFINE; i++) {
+        let even = (high.x - low.x) * speed > 0.5;
+        at_m = select(low.x + (high.x - low.x) * low.y / (low.y - high.y), 0.5 * (low.x + high.x), even);
+        let here = distance_at(ray.origin + ray.along * at_m);
+        if here == UNKNOWN { return UNKNOWN; }
+        if abs(here) < CLOSE { break; }
+        if here >= 0.0 { low = vec2f(at_m, here); } else { high = vec2f(at_m, here); }
+    }
+    return at_m;
+}
+
+// Depth of the first surface that faces the camera; UNKNOWN where there is none.
+fn march(ray: Ray) -> f32 {
+    let speed = length(ray.along);
+    var at_m = ray.begin_m;
+    var outside = vec2f(-1.0, 0.0); // Depth and distance of the last place known to be outside; depth -1: none.
+    var careful_m = -1.0; // Up to this depth steps are short: a long one passed a place that nobody saw.
+    for (var i = 0u; i < MAX_STEPS; i++) {
+        if !(at_m < ray.end_m) { break; }
+        let point = ray.origin + ray.along * at_m;
+        let voxel = vec3i(floor(point));
+        let slot = slot_of(voxel >> vec3u(3u));
+        if slot == 0u {
+            let chunk = voxel >> vec3u(6u);
+            let is_empty = row_of(chunk) == 0u;
+            let edge = select(8, 64, is_empty);
+            let corner = select((voxel >> vec3u(3u)) * 8, chunk * 64, is_empty);
+            at_m = max(at_m, leaves(ray, corner, edge)) + 0.01 / speed;
+            outside.x = -1.0;
+            continue;
+        }
+        let word = geometry[(slot - 1u) * BLOCK_VOXELS + voxel_in_block(voxel)];
+        let nearest = stored_distance(word) * field.scale_m / field.voxel_m;
+        let is_careful = at_m < careful_m;
+        if stored_weight(word) == 0u { // One of the eight around, so they say nothing either.
+            at_m += select(1.0, 0.25, is_careful) / speed;
+            continue;
+        }
+        if nearest > 1.5 && !is_careful {
+            outside = vec2f(at_m, nearest);
+            at_m += 0.8 * nearest / speed;
+            continue;
+        }
+        let here = distance_at(point);
+        if here == UNKNOWN {
+            at_m += select(0.5, 0.25, is_careful) / speed;
+        } else if here >= 0.0 {
+            outside = vec2f(at_m, here);
+            at_m += select(max(0.8 * here, 0.25), 0.25, is_careful) / speed;
+        } else {
+            if outside.x >= 0.0 {
+                let found = crossing(ray, outside.x, at_m, outside.y, here, speed);
+                if found != UNKNOWN { return found; }
+                if !is_careful {
+                    careful_m = at_m + 0.5 / speed;
+                    at_m = outside.x;
+                    outside.x = -1.0;
+                    continue;
+                }
+            }
+            outside.x = -1.0;
+            at_m += max(-0.8 * here, 0.5) / speed;
+        }
+    }
+    return UNKNOWN;
+}
+
+@compute @workgroup_size(8, 8)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_id) lane: vec3u) {
+    let ix = folded(wg, n_wgs);
+    let n_columns = (view.size_px.x + 7u) / 8u;
+    let pixel = vec2u(ix % n_columns, ix / n_columns) * 8u + lane.xy;
+    if any(pixel >= view.size_px) { return; } // Allowed here: no barrier below.
+    known_chunk = vec3i(0x7fffffff);
+    known_block = vec3i(0x7fffffff);
+    let ray = ray_of(pixel);
+    var depth_m = UNKNOWN;
+    if status[BOUNDS_HIGH] != 0u { depth_m = march(ray); }
+    let is_hit = depth_m != UNKNOWN;
+    var rgb = backdrop.srgb.rgb;
+    if is_hit { rgb = color_at(ray.origin + ray.along * depth_m); }
+    let bytes = vec4u(floor(vec4f(clamp(rgb, vec3f(0.0), vec3f(1.0)), select(0.0, 1.0, is_hit)) * 255.0 + 0.5));
+    let at = pixel.y * view.size_px.x + pixel.x;
+    pixels[at] = bytes.x | (bytes.y << 8u) | (bytes.z << 16u) | (bytes.w << 24u);
+    depths[at] = select(0.0, depth_m, is_hit);
+}

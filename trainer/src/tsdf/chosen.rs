@@ -1,0 +1,118 @@
+//! How finely a scene is divided: given, or from the first depth image.
+
+use super::block::WEIGHT_ONE;
+use super::options::TsdfOptions;
+use crate::DepthMap;
+use kinematics::Transform;
+use nalgebra::{Translation3, UnitQuaternion};
+use serde::{Deserialize, Serialize};
+
+/// Finest and coarsest voxels that are chosen unasked, metres.
+const VOXEL_RANGE_M: [f64; 2] = [0.001, 0.2];
+/// Voxels of the least truncation.
+const TRUNCATION_VOXELS: f64 = 4.0;
+/// How many times the least truncation noise may make of it.
+const MOST_TRUNCATION: f64 = 4.0;
+/// Of `max_bytes` the field may take for what one image shows when voxels are chosen: the scene goes on beyond it.
+const SHARE_OF_ONE_IMAGE: f64 = 0.1;
+
+/// A field's voxels, settled.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Lattice {
+    /// Edge of a voxel, metres.
+    pub voxel_m: f64,
+    /// Least truncation, metres.
+    pub truncation_m: f64,
+    /// Most truncation, and the distance that the largest stored number stands for, metres.
+    pub scale_m: f64,
+    /// Standard deviation of depth at 1 m, metres.
+    pub noise_per_m2: f64,
+    /// Depth beyond this is not believed, metres.
+    pub max_depth_m: f64,
+    /// Most weight of a voxel, in 256ths.
+    pub max_weight: u32,
+    /// Where the field's coordinates begin, in world: near the first camera, so that f32 is fine anywhere.
+    pub anchor_m: [f64; 3],
+}
+
+impl Lattice {
+    /// Settles what the options leave open by the first depth image; `None` where that shows nothing.
+    ///
+    /// A voxel is as wide as a pixel at the median depth, no less than twice the noise there, and wide enough that what
+    /// this image shows takes a tenth of `max_bytes`. Noise is what is left of depth when a plane through neighbors is
+    /// taken away: of `|z[-1] - 2 z[0] + z[1]|` the 90th percentile over `1.6449 sqrt(6)`. Not the median: where a sensor
+    /// tells whole steps that is 0.
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a weight is clamped to 16 bits")]
+    pub fn choose(options: &TsdfOptions, depth: &DepthMap) -> Option<Self> {
+        let mut depths: Vec<f64> = believed(options, depth).map(|(_, z)| z).collect();
+        let n_believed = depths.len();
+        let median_m = quantile(&mut depths, 5)?;
+        let noise_per_m2 = usable(options.noise_per_m2).unwrap_or_else(|| noise_per_m2(options, depth));
+        let px_m = median_m / (0.5 * (depth.focal_px[0] + depth.focal_px[1]));
+        let by_noise_m = 2.0 * noise_per_m2 * median_m * median_m;
+        // A surface of n pixels has n (px / voxel)^2 voxels, and its band about as many blocks as a 16th of them.
+        let area_m2 = n_believed as f64 * px_m * px_m;
+        let by_bytes_m = options.max_bytes.map_or(0.0, |bytes| {
+            let n_blocks = SHARE_OF_ONE_IMAGE * bytes as f64 / super::buffers::BYTES_PER_BLOCK as f64;
+            (area_m2 / (16.0 * n_blocks.max(1.0))).sqrt()
+        });
+        let chosen = px_m.max(by_noise_m).max(by_bytes_m).clamp(VOXEL_RANGE_M[0], VOXEL_RANGE_M[1]);
+        let voxel_m = usable(options.voxel_m).unwrap_or_else(|| (chosen * 2e3).ceil() / 2e3);
+        let truncation_m = usable(options.truncation_m).unwrap_or(TRUNCATION_VOXELS * voxel_m).max(2.0 * voxel_m);
+        let chunk_m = 64.0 * voxel_m;
+        let anchor = depth.world_from_camera.translation.vector.map(|along| (along / chunk_m).round() * chunk_m);
+        let lattice = Self {
+            voxel_m,
+            truncation_m,
+            scale_m: MOST_TRUNCATION * truncation_m,
+            noise_per_m2,
+            max_depth_m: options.max_depth_m,
+            max_weight: (options.max_weight * WEIGHT_ONE).clamp(1.0, 65_535.0) as u32,
+            anchor_m: anchor.into(),
+        };
+        log::info!(
+            "tsdf: voxels of {:.1} mm, truncation {:.1} mm, depth noise {:.2} mm at 1 m (median depth {median_m:.2} m)",
+            1e3 * voxel_m,
+            1e3 * truncation_m,
+            1e3 * noise_per_m2
+        );
+        Some(lattice)
+    }
+
+    /// Metres from the anchor along the world's axes.
+    pub fn field_from_world(&self) -> Transform {
+        let [x, y, z] = self.anchor_m;
+        Transform::from_parts(Translation3::new(-x, -y, -z), UnitQuaternion::identity())
+    }
+}
+
+fn usable(given: Option<f64>) -> Option<f64> {
+    given.filter(|value| value.is_finite() && *value > 0.0)
+}
+
+/// Index and depth of the pixels that may be believed.
+fn believed<'a>(options: &'a TsdfOptions, depth: &'a DepthMap) -> impl Iterator<Item = (usize, f64)> + 'a {
+    let depths = depth.depth_m.iter().map(|z| f64::from(*z)).enumerate();
+    depths.filter(|(_, z)| *z > 0.01 && *z <= options.max_depth_m)
+}
+
+fn noise_per_m2(options: &TsdfOptions, depth: &DepthMap) -> f64 {
+    let width = depth.size_px[0] as usize;
+    let at =
+        |ix: usize| depth.depth_m.get(ix).map(|z| f64::from(*z)).filter(|z| *z > 0.01 && *z <= options.max_depth_m);
+    let mut bends: Vec<f64> = believed(options, depth)
+        .filter(|(ix, _)| ix % width > 0 && ix % width + 1 < width)
+        .filter_map(|(ix, z)| Some((at(ix - 1)? - 2.0 * z + at(ix + 1)?).abs() / (z * z)))
+        .collect();
+    quantile(&mut bends, 9).unwrap_or(0.0) / (1.6449 * 6.0f64.sqrt())
+}
+
+/// The value that so many tenths lie below.
+fn quantile(values: &mut [f64], tenths: usize) -> Option<f64> {
+    let at = values.len() * tenths / 10;
+    if values.is_empty() {
+        return None;
+    }
+    Some(*values.select_nth_unstable_by(at, f64::total_cmp).1)
+}

@@ -1,0 +1,138 @@
+// integrate: fuses one depth image, and the color image that goes with it, into the visible blocks.
+//
+// groups    as many as there are: each takes a visible block after the other; 64 threads, one per column along z
+// reads     field, frame, readings [depth pixels], image [color pixels] (rgba8; a = 0 where masked), coords,
+//           visible [N_VISIBLE]
+// writes    geometry, colors [n_blocks * 512], changed [n_blocks] (1 where a voxel changed)
+// twin      tsdf/reference/integrate.rs
+// source    Curless and Levoy 1996, section 3; weights: Newcombe et al. 2011 (angle; here the square of
+//           its cosine, as an error across the ray moves the surface by its tangent) and Oleynikova et al. 2017 (Voxblox:
+//           inverse square of distance, drop behind the surface). Ours: distances are taken along the surface's normal,
+//           and what is seen through loses weight instead of gaining a distance it cannot have: to see past a voxel says
+//           that nothing solid is there, not how far the nearest surface is.
+
+#import field
+#import field_status
+#import depth_frame
+
+@group(0) @binding(0) var<uniform> field: Field;
+@group(0) @binding(1) var<uniform> frame: DepthFrame;
+@group(0) @binding(2) var<storage, read> readings: array<vec2f>;
+@group(0) @binding(3) var<storage, read> image: array<u32>;
+@group(0) @binding(4) var<storage, read> coords: array<vec4i>;
+@group(0) @binding(5) var<storage, read> visible: array<u32>;
+@group(0) @binding(6) var<storage, read> status: array<u32>;
+@group(0) @binding(7) var<storage, read_write> geometry: array<u32>;
+@group(0) @binding(8) var<storage, read_write> colors: array<vec2u>;
+@group(0) @binding(9) var<storage, read_write> changed: array<atomic<u32>>;
+
+// Least cosine between ray and normal that distances are shortened by: normals of steeper surfaces are mostly noise.
+const MIN_TURNED = 0.3;
+// One look through a solid voxel takes back as many looks at it.
+const CARVING = 4.0;
+// Colors are kept this near to the surface, voxels: what pictures and meshes read.
+const COLOR_VOXELS = 2.0;
+
+fn reading_at(pixel: vec2i) -> vec2f {
+    let inside = clamp(pixel, vec2i(0), vec2i(frame.depth_size_px) - 1);
+    return readings[u32(inside.y) * frame.depth_size_px.x + u32(inside.x)];
+}
+
+// Between four readings where all are believed, else the nearest one's.
+fn reading_near(place_px: vec2f) -> vec2f {
+    let corner = floor(place_px - 0.5);
+    let share = place_px - 0.5 - corner;
+    let base = vec2i(corner);
+    let a = reading_at(base);
+    let b = reading_at(base + vec2i(1, 0));
+    let c = reading_at(base + vec2i(0, 1));
+    let d = reading_at(base + vec2i(1, 1));
+    let all_believed = min(min(a.x, b.x), min(c.x, d.x)) > 0.0;
+    let between = mix(mix(a, b, share.x), mix(c, d, share.x), share.y);
+    return select(reading_at(vec2i(floor(place_px))), between, all_believed);
+}
+
+fn pixel_at(pixel: vec2i) -> vec4f {
+    let inside = clamp(pixel, vec2i(0), vec2i(frame.color_size_px) - 1);
+    return unpack4x8unorm(image[u32(inside.y) * frame.color_size_px.x + u32(inside.x)]);
+}
+
+// Color at a point, between four pixels; alpha is less than 1 where it falls outside the image or on a mask.
+fn color_near(point_in_field: vec3f) -> vec4f {
+    let point = color_from_field(frame, point_in_field);
+    let place_px = frame.color_focal_px * point.xy / point.z + frame.color_principal_px;
+    let inside = point.z > 0.0 && all(place_px >= vec2f(0.0)) && all(place_px < vec2f(frame.color_size_px));
+    if !inside { return vec4f(0.0); }
+    let corner = floor(place_px - 0.5);
+    let share = place_px - 0.5 - corner;
+    let base = vec2i(corner);
+    let top = mix(pixel_at(base), pixel_at(base + vec2i(1, 0)), share.x);
+    let bottom = mix(pixel_at(base + vec2i(0, 1)), pixel_at(base + vec2i(1, 1)), share.x);
+    return mix(top, bottom, share.y);
+}
+
+fn fuse_color(at: u32, point_in_field: vec3f, gained: u32) {
+    let seen = color_near(point_in_field);
+    if !(seen.a > 0.999) { return; }
+    let old = colors[at];
+    let weight = old.y >> 16u;
+    let had = vec3f(vec3u(old.x & 0xffffu, old.x >> 16u, old.y & 0xffffu)) / 65535.0;
+    let sum = weight + gained;
+    let now = (had * f32(weight) + seen.rgb * f32(gained)) / f32(sum);
+    let rgb = vec3u(floor(clamp(now, vec3f(0.0), vec3f(1.0)) * 65535.0 + 0.5));
+    colors[at] = vec2u(rgb.x | (rgb.y << 16u), rgb.z | (min(sum, field.max_weight) << 16u));
+}
+
+// Whether the voxel changed.
+fn fuse(at: u32, point_in_field: vec3f) -> bool {
+    let point = depth_from_field(frame, point_in_field);
+    let place_px = frame.depth_focal_px * point.xy / point.z + frame.depth_principal_px;
+    let inside = point.z > 0.0 && all(place_px >= vec2f(0.0)) && all(place_px < vec2f(frame.depth_size_px));
+    if !inside { return false; }
+    let reading = reading_near(place_px);
+    if !(reading.x > 0.0) { return false; }
+    let distance_m = (reading.x - point.z) * max(reading.y, MIN_TURNED);
+    let truncation_m = truncation_at(field, reading.x);
+    let ray_m = length(ray_of(frame, place_px));
+    // Along the ray, not the normal: past the rim of a thing a ray soon leaves it again.
+    let behind_m = (point.z - reading.x) * ray_m;
+    if !(behind_m <= truncation_m) { return false; } // Hidden.
+    let nearness = min(1.0, 1.0 / (reading.x * reading.x));
+    let behind = clamp((truncation_m - behind_m) / (truncation_m - field.voxel_m), 0.0, 1.0);
+    let cosine = reading.y / ray_m;
+    let gain = nearness * cosine * cosine * behind;
+    let old = geometry[at];
+    let weight = stored_weight(old);
+    if distance_m > truncation_m {
+        // Seen through: that counts against what was taken for solid, and says nothing else. How well it is seen is a
+        // matter of where the voxel is, not of what lies behind it.
+        if weight == 0u || stored_distance(old) >= 0.0 { return false; }
+        let lost = u32(max(floor(CARVING * WEIGHT_ONE * min(1.0, 1.0 / (point.z * point.z)) + 0.5), 1.0));
+        geometry[at] = select(old - (lost << 16u), 0u, lost >= weight);
+        return true;
+    }
+    let gained = u32(clamp(floor(WEIGHT_ONE * gain + 0.5), 1.0, WEIGHT_ONE));
+    let sum = weight + gained;
+    let mean = (stored_distance(old) * f32(weight) + distance_m / field.scale_m * f32(gained)) / f32(sum);
+    let stored = i32(floor(clamp(mean, -1.0, 1.0) * 32767.0 + 0.5));
+    geometry[at] = (u32(stored) & 0xffffu) | (min(sum, field.max_weight) << 16u);
+    if abs(distance_m) <= COLOR_VOXELS * field.voxel_m {
+        fuse_color(at, point_in_field, gained);
+    }
+    return true;
+}
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let n_visible = status[N_VISIBLE];
+    for (var at = folded(wg, n_wgs); at < n_visible; at += n_wgs.x * n_wgs.y) {
+        let slot = visible[at];
+        let first = coords[slot].xyz * 8 + vec3i(vec3u(lane & 7u, lane >> 3u, 0u));
+        var any_changed = false;
+        for (var z = 0; z < 8; z++) {
+            let center = (vec3f(first + vec3i(0, 0, z)) + 0.5) * field.voxel_m;
+            any_changed = fuse(slot * BLOCK_VOXELS + u32(z) * 64u + lane, center) || any_changed;
+        }
+        if any_changed { atomicStore(&changed[slot], 1u); }
+    }
+}

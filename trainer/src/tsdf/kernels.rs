@@ -1,0 +1,134 @@
+//! The kernels of this model, compiled.
+
+use crate::Error;
+use crate::gpu::{Gpu, Kernel, Pipeline, Source};
+
+macro_rules! source {
+    ($name:literal) => {
+        Source { name: $name, text: include_str!(concat!("../shared/", $name, ".wgsl")) }
+    };
+}
+
+const SHARED: &[Source] =
+    &[source!("view"), source!("field"), source!("field_status"), source!("field_insert"), source!("depth_frame")];
+
+macro_rules! kernel {
+    ($name:literal) => {
+        Kernel { source: Source { name: $name, text: include_str!(concat!($name, ".wgsl")) }, shared: SHARED }
+    };
+}
+
+/// All kernels of this module, for validation.
+pub const KERNELS: &[Kernel] = &[
+    kernel!("readings"),
+    kernel!("allocate_blocks"),
+    kernel!("index_blocks"),
+    kernel!("find_visible"),
+    kernel!("integrate"),
+    kernel!("end_frame"),
+    kernel!("gather_blocks"),
+    kernel!("cast_rays"),
+];
+
+/// All of them, compiled.
+#[derive(Debug)]
+pub(crate) struct Pipelines {
+    pub(crate) readings: Pipeline,
+    pub(crate) allocate_blocks: Pipeline,
+    pub(crate) index_blocks: Pipeline,
+    pub(crate) find_visible: Pipeline,
+    pub(crate) integrate: Pipeline,
+    pub(crate) end_frame: Pipeline,
+    pub(crate) gather_blocks: Pipeline,
+    pub(crate) cast_rays: Pipeline,
+}
+
+impl Pipelines {
+    pub(crate) fn new(gpu: &Gpu) -> Result<Self, Error> {
+        Ok(Self {
+            readings: Pipeline::new(gpu, kernel!("readings"), &[])?,
+            allocate_blocks: Pipeline::new(gpu, kernel!("allocate_blocks"), &[])?,
+            index_blocks: Pipeline::new(gpu, kernel!("index_blocks"), &[])?,
+            find_visible: Pipeline::new(gpu, kernel!("find_visible"), &[])?,
+            integrate: Pipeline::new(gpu, kernel!("integrate"), &[])?,
+            end_frame: Pipeline::new(gpu, kernel!("end_frame"), &[])?,
+            gather_blocks: Pipeline::new(gpu, kernel!("gather_blocks"), &[])?,
+            cast_rays: Pipeline::new(gpu, kernel!("cast_rays"), &[])?,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::gpu::{reflect, resolve};
+    use crate::splat::View;
+    use crate::tsdf::params::{Backdrop, DepthFrame, Field};
+
+    /// Names and offsets of a struct's fields and its size, as WGSL lays it out in every kernel that knows it.
+    fn layout_in_wgsl(name: &str) -> (Vec<(String, usize)>, usize) {
+        let layouts = super::KERNELS.iter().filter_map(|kernel| {
+            let module = reflect(kernel.source.name, &resolve(kernel.source, kernel.shared).unwrap()).unwrap();
+            module.types.iter().find_map(|(_, found)| match &found.inner {
+                wgpu::naga::TypeInner::Struct { members, span } if found.name.as_deref() == Some(name) => {
+                    let fields = members.iter().map(|member| (member.name.clone().unwrap(), member.offset as usize));
+                    Some((fields.collect(), *span as usize))
+                }
+                _ => None,
+            })
+        });
+        let layouts: Vec<(Vec<_>, usize)> = layouts.collect();
+        assert!(layouts.iter().all(|layout| *layout == layouts[0]), "{name} differs between kernels: {layouts:?}");
+        layouts[0].clone()
+    }
+
+    macro_rules! assert_layout {
+        ($type:ident, [$($field:ident),*]) => {
+            let in_rust = vec![$((stringify!($field).to_owned(), std::mem::offset_of!($type, $field))),*];
+            assert_eq!((in_rust, size_of::<$type>()), layout_in_wgsl(stringify!($type)), stringify!($type));
+        };
+    }
+
+    #[test]
+    fn structs_have_the_same_fields_in_rust_and_wgsl() {
+        assert_layout!(
+            Field,
+            [voxel_m, truncation_m, scale_m, noise_per_m2, max_depth_m, max_weight, n_chunk_slots, n_block_slots]
+        );
+        assert_layout!(
+            DepthFrame,
+            [
+                depth_row_0,
+                depth_row_1,
+                depth_row_2,
+                field_row_0,
+                field_row_1,
+                field_row_2,
+                color_row_0,
+                color_row_1,
+                color_row_2,
+                depth_focal_px,
+                depth_principal_px,
+                color_focal_px,
+                color_principal_px,
+                depth_size_px,
+                color_size_px
+            ]
+        );
+        assert_layout!(Backdrop, [srgb]);
+        assert_eq!(layout_in_wgsl("View").1, size_of::<View>());
+    }
+
+    #[test]
+    fn every_kernel_parses_and_validates() {
+        let refused: Vec<String> = super::KERNELS
+            .iter()
+            .filter_map(|kernel| {
+                resolve(kernel.source, kernel.shared)
+                    .and_then(|text| reflect(kernel.source.name, &text).map(|_| ()))
+                    .err()
+            })
+            .map(|error| error.to_string())
+            .collect();
+        assert!(refused.is_empty(), "{}", refused.join("\n"));
+    }
+}

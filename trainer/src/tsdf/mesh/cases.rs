@@ -1,0 +1,112 @@
+//! How a surface crosses a cube, for each of the 256 ways its corners can lie inside or outside.
+//!
+//! The idea is that of marching cubes (Lorensen and Cline 1987); the table is made here, not copied: on each face every run
+//! of inside corners is cut off by one segment, so two cubes agree on the face they share, and segments join to loops.
+
+use std::sync::LazyLock;
+
+/// A cube's edge: the corner it begins at, as bits x, y, z, and the axis it runs along.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Edge {
+    pub(super) corner: usize,
+    pub(super) axis: usize,
+}
+
+/// Triangles of each case, as edges; bit c of a case's number says that corner c is inside.
+pub(super) static CASES: LazyLock<[Vec<[Edge; 3]>; 256]> = LazyLock::new(|| std::array::from_fn(triangles));
+
+/// Corners of the six faces, counterclockwise as seen from outside.
+const FACES: [[usize; 4]; 6] = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];
+
+fn edge_between(a: usize, b: usize) -> Edge {
+    Edge { corner: a & b, axis: (a ^ b).trailing_zeros() as usize }
+}
+
+fn triangles(case: usize) -> Vec<[Edge; 3]> {
+    let mut segments = segments(case);
+    let mut triangles = Vec::new();
+    while let Some((first, mut end)) = segments.pop() {
+        let mut corners = vec![first];
+        while end != first {
+            corners.push(end);
+            let next = segments
+                .iter()
+                .position(|(begin, _)| *begin == end)
+                .expect("each edge ends one segment and begins one");
+            end = segments.swap_remove(next).1;
+        }
+        triangles.extend((1..corners.len() - 1).map(|ix| [corners[0], corners[ix], corners[ix + 1]]));
+    }
+    triangles
+}
+
+/// Where the surface cuts the faces, each segment so that the inside is on its right as seen from outside the cube.
+fn segments(case: usize) -> Vec<(Edge, Edge)> {
+    let is_inside = |corner: usize| case >> corner & 1 == 1;
+    let mut segments = Vec::new();
+    for face in FACES {
+        for at in 0..4 {
+            let (before, here) = (face[at], face[(at + 1) % 4]);
+            if is_inside(before) || !is_inside(here) {
+                continue;
+            }
+            let mut along = at + 1;
+            while is_inside(face[(along + 1) % 4]) {
+                along += 1;
+            }
+            segments.push((edge_between(before, here), edge_between(face[along % 4], face[(along + 1) % 4])));
+        }
+    }
+    segments
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_crossed_edge_is_used_and_no_other() {
+        for (case, triangles) in CASES.iter().enumerate() {
+            for corner in 0..8usize {
+                for axis in (0..3).filter(|axis| corner >> axis & 1 == 0) {
+                    let crossed = (case >> corner ^ case >> (corner | 1 << axis)) & 1 == 1;
+                    let used = triangles.iter().flatten().any(|edge| *edge == Edge { corner, axis });
+                    assert_eq!(used, crossed, "case {case}, corner {corner}, axis {axis}");
+                }
+            }
+        }
+        let most = CASES.iter().map(Vec::len).max().unwrap();
+        assert!(most <= 5, "{most} triangles");
+    }
+
+    #[test]
+    fn triangles_face_away_from_the_inside() {
+        // Corner 0 alone is inside: the normal points to where all coordinates grow.
+        let place = |edge: Edge| -> [f64; 3] {
+            std::array::from_fn(|axis| if axis == edge.axis { 0.5 } else { (edge.corner >> axis & 1) as f64 })
+        };
+        let [a, b, c] = CASES[1][0].map(|edge| nalgebra::Vector3::from(place(edge)));
+        assert!((b - a).cross(&(c - a)).dot(&nalgebra::Vector3::repeat(1.0)) > 0.0);
+    }
+
+    #[test]
+    fn loops_are_closed_within_the_cube() {
+        // An edge of a triangle that does not lie on a face of the cube belongs to two triangles.
+        for triangles in CASES.iter() {
+            for triangle in triangles {
+                for side in 0..3 {
+                    let (from, to) = (triangle[side], triangle[(side + 1) % 3]);
+                    let back =
+                        triangles.iter().any(|other| (0..3).any(|k| (other[k], other[(k + 1) % 3]) == (to, from)));
+                    assert!(back || on_one_face(from, to), "{from:?} {to:?}");
+                }
+            }
+        }
+    }
+
+    fn on_one_face(a: Edge, b: Edge) -> bool {
+        FACES.iter().any(|face| {
+            [a, b].iter().all(|edge| face.contains(&edge.corner) && face.contains(&(edge.corner | 1 << edge.axis)))
+        })
+    }
+}

@@ -1,0 +1,79 @@
+//! Fewer triangles: vertices that share a cell of a coarse grid become one.
+
+use super::Mesh;
+use nalgebra::Vector3;
+use std::collections::{BTreeSet, HashMap};
+
+/// What the vertices of a cell add up to.
+#[derive(Default)]
+struct Sum {
+    n: f64,
+    position_m: Vector3<f64>,
+    normal: Vector3<f64>,
+    color: Vector3<f64>,
+}
+
+impl Mesh {
+    /// The mesh with one vertex per cell of a grid of this width, at the mean of those it stands for; triangles whose
+    /// corners meet vanish. A width that is no positive number changes nothing.
+    ///
+    /// Source: Rossignac and Borrel 1993, with means instead of representatives.
+    #[must_use]
+    #[expect(clippy::cast_possible_truncation, reason = "cells are rounded down on purpose, and sums are f64")]
+    pub fn clustered(&self, cell_m: f64) -> Self {
+        if !(cell_m > 0.0 && cell_m.is_finite()) {
+            return self.clone();
+        }
+        let mut cells: HashMap<[i64; 3], u32> = HashMap::new();
+        let mut sums: Vec<Sum> = Vec::new();
+        let mut places = Vec::with_capacity(self.positions_m.len());
+        for (ix, position) in self.positions_m.iter().enumerate() {
+            let cell = position.map(|along| (f64::from(along) / cell_m).floor() as i64);
+            let next = u32::try_from(sums.len()).unwrap_or(u32::MAX);
+            let at = *cells.entry(cell).or_insert(next);
+            if at == next {
+                sums.push(Sum::default());
+            }
+            let sum = &mut sums[at as usize];
+            sum.n += 1.0;
+            sum.position_m += Vector3::from(position.map(f64::from));
+            sum.normal += Vector3::from(self.normals[ix].map(f64::from));
+            sum.color += Vector3::from(self.colors_srgb[ix].map(f64::from));
+            places.push(at);
+        }
+        Self {
+            origin_m: self.origin_m,
+            positions_m: sums.iter().map(|sum| (sum.position_m / sum.n).map(|along| along as f32).into()).collect(),
+            normals: sums.iter().map(normal_of).collect(),
+            #[expect(clippy::cast_sign_loss, reason = "a mean of bytes")]
+            colors_srgb: sums.iter().map(|sum| (sum.color / sum.n).map(|part| part.round() as u8).into()).collect(),
+            triangles: merged(&self.triangles, &places),
+        }
+    }
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "sums are f64, normals f32")]
+fn normal_of(sum: &Sum) -> [f32; 3] {
+    sum.normal.try_normalize(1e-9).unwrap_or_else(Vector3::z).map(|along| along as f32).into()
+}
+
+/// The triangles that are left, each once, whichever corner it begins with.
+fn merged(triangles: &[[u32; 3]], places: &[u32]) -> Vec<[u32; 3]> {
+    let mut seen = BTreeSet::new();
+    let mut left = Vec::new();
+    for triangle in triangles {
+        let [a, b, c] = triangle.map(|ix| places[ix as usize]);
+        let least = a.min(b).min(c);
+        let turned = if a == least {
+            [a, b, c]
+        } else if b == least {
+            [b, c, a]
+        } else {
+            [c, a, b]
+        };
+        if a != b && b != c && c != a && seen.insert(turned) {
+            left.push(turned);
+        }
+    }
+    left
+}

@@ -1,0 +1,101 @@
+//! Meshes as `.glb`: glTF 2.0 (Khronos 2021), one JSON and one binary chunk.
+
+use super::Mesh;
+use crate::Error;
+use serde_json::json;
+use std::path::Path;
+
+const MAGIC: u32 = 0x4654_6c67;
+const JSON_CHUNK: u32 = 0x4e4f_534a;
+const BIN_CHUNK: u32 = 0x004e_4942;
+const FLOAT: u32 = 5126;
+const UNSIGNED_INT: u32 = 5125;
+const VERTICES: u32 = 34_962;
+const INDICES: u32 = 34_963;
+
+/// Writes a mesh. glTF has y up and z towards the viewer, the world has z up: a node turns it; another holds the origin.
+pub fn write(path: &Path, mesh: &Mesh) -> Result<(), Error> {
+    std::fs::write(path, to_bytes(mesh)).map_err(|source| Error::Write { path: path.to_owned(), source })
+}
+
+/// The file.
+pub(super) fn to_bytes(mesh: &Mesh) -> Vec<u8> {
+    let parts = parts(mesh);
+    let mut json = description(mesh, &parts).to_string().into_bytes();
+    json.resize(json.len().next_multiple_of(4), b' ');
+    let bin = parts.concat();
+    let length = |n: usize| u32::try_from(n).unwrap_or(u32::MAX).to_le_bytes();
+    let mut file = Vec::with_capacity(28 + json.len() + bin.len());
+    file.extend(MAGIC.to_le_bytes());
+    file.extend(2u32.to_le_bytes());
+    let n_chunks_bytes = if bin.is_empty() { 8 + json.len() } else { 16 + json.len() + bin.len() };
+    file.extend(length(12 + n_chunks_bytes));
+    file.extend(length(json.len()));
+    file.extend(JSON_CHUNK.to_le_bytes());
+    file.extend(json);
+    if !bin.is_empty() {
+        file.extend(length(bin.len()));
+        file.extend(BIN_CHUNK.to_le_bytes());
+        file.extend(bin);
+    }
+    file
+}
+
+/// Positions, normals, colors and indices, each a multiple of 4 bytes.
+fn parts(mesh: &Mesh) -> [Vec<u8>; 4] {
+    let floats = |values: &[[f32; 3]]| values.iter().flatten().flat_map(|value| value.to_le_bytes()).collect();
+    // glTF takes vertex colors for linear.
+    let colors = mesh.colors_srgb.iter().flatten().flat_map(|byte| linear(*byte).to_le_bytes()).collect();
+    let indices = mesh.triangles.iter().flatten().flat_map(|ix| ix.to_le_bytes()).collect();
+    [floats(&mesh.positions_m), floats(&mesh.normals), colors, indices]
+}
+
+fn linear(byte: u8) -> f32 {
+    let part = f32::from(byte) / 255.0;
+    if part <= 0.04045 { part / 12.92 } else { ((part + 0.055) / 1.055).powf(2.4) }
+}
+
+fn description(mesh: &Mesh, parts: &[Vec<u8>; 4]) -> serde_json::Value {
+    let asset = json!({"version": "2.0", "generator": "fieldrig"});
+    if mesh.triangles.is_empty() {
+        return json!({"asset": asset, "scene": 0, "scenes": [{}]});
+    }
+    let mut offset = 0;
+    let views: Vec<_> = parts
+        .iter()
+        .zip([VERTICES, VERTICES, VERTICES, INDICES])
+        .map(|(part, target)| {
+            let view = json!({"buffer": 0, "byteOffset": offset, "byteLength": part.len(), "target": target});
+            offset += part.len();
+            view
+        })
+        .collect();
+    let extreme = |pick: fn(f32, f32) -> f32, begin: f32| -> Vec<f32> {
+        (0..3).map(|axis| mesh.positions_m.iter().map(|place| place[axis]).fold(begin, pick)).collect()
+    };
+    let n = mesh.positions_m.len();
+    let vec3 = |view: u32| json!({"bufferView": view, "componentType": FLOAT, "count": n, "type": "VEC3"});
+    let mut positions = vec3(0);
+    positions["min"] = json!(extreme(f32::min, f32::INFINITY));
+    positions["max"] = json!(extreme(f32::max, f32::NEG_INFINITY));
+    let indices = json!({
+        "bufferView": 3, "componentType": UNSIGNED_INT, "count": 3 * mesh.triangles.len(), "type": "SCALAR"
+    });
+    let half = std::f64::consts::FRAC_1_SQRT_2;
+    json!({
+        "asset": asset,
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [
+            {"name": "world", "rotation": [-half, 0.0, 0.0, half], "children": [1]},
+            {"name": "mesh", "translation": mesh.origin_m, "mesh": 0},
+        ],
+        "meshes": [{"primitives": [{
+            "attributes": {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2}, "indices": 3, "material": 0
+        }]}],
+        "materials": [{"doubleSided": true, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}],
+        "accessors": [positions, vec3(1), vec3(2), indices],
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+    })
+}

@@ -1,0 +1,164 @@
+//! Meshes of known shapes: how far off they are, whether they are closed, and the files.
+
+use super::{Mesh, write_glb, write_ply};
+use crate::gpu::{Gpu, GpuOptions};
+use crate::tsdf::scenes::{self, Shape};
+use crate::tsdf::{TsdfModel, TsdfOptions};
+use crate::{Keyframe, Method};
+use nalgebra::{Point3, Vector3};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+fn model(options: TsdfOptions, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
+    let mut model = TsdfModel::new(Gpu::open(&GpuOptions::default()).unwrap(), options).unwrap();
+    for keyframe in keyframes {
+        model.push(keyframe.clone()).unwrap();
+    }
+    model.seed().unwrap();
+    model
+}
+
+fn places(mesh: &Mesh) -> impl Iterator<Item = Point3<f64>> {
+    let origin = Vector3::from(mesh.origin_m);
+    mesh.positions_m.iter().map(move |place| (Vector3::from(place.map(f64::from)) + origin).into())
+}
+
+/// Mean and largest distance of the vertices from a shape, metres.
+fn errors_m(mesh: &Mesh, shape: &Shape) -> (f64, f64) {
+    let errors: Vec<f64> = places(mesh).map(|place| shape.distance_m(&place).abs()).collect();
+    (errors.iter().sum::<f64>() / errors.len() as f64, errors.iter().copied().fold(0.0, f64::max))
+}
+
+/// How often each edge is there, in either direction.
+fn edges(mesh: &Mesh) -> BTreeMap<[u32; 2], i32> {
+    let mut edges = BTreeMap::new();
+    for [a, b, c] in &mesh.triangles {
+        for (from, to) in [(a, b), (b, c), (c, a)] {
+            *edges.entry([*from.min(to), *from.max(to)]).or_insert(0) += 1;
+        }
+    }
+    edges
+}
+
+fn ball_mesh() -> (Mesh, Shape, f64) {
+    let ball = scenes::ball(Point3::new(0.31, -0.22, 0.13));
+    let Shape::Sphere { center_m, .. } = ball else { unreachable!("a ball is a sphere") };
+    let mut model = model(scenes::options(), &scenes::all_around(&[ball], center_m, 24));
+    (model.mesh().unwrap(), ball, 0.02)
+}
+
+#[test]
+fn a_ball_seen_from_all_sides_is_closed_and_round() {
+    let (mesh, ball, voxel_m) = ball_mesh();
+    let (mean_m, most_m) = errors_m(&mesh, &ball);
+    assert!(mean_m < 0.1 * voxel_m && most_m < 0.5 * voxel_m, "mean {mean_m} m, most {most_m} m");
+    let open = edges(&mesh).into_values().filter(|n| *n != 2).count();
+    assert_eq!(open, 0, "of {} triangles", mesh.triangles.len());
+    assert!(mesh.triangles.len() > 1000);
+    // Euler: a closed surface without holes.
+    let n_edges = edges(&mesh).len();
+    assert_eq!(mesh.positions_m.len() + mesh.triangles.len(), n_edges + 2);
+    let Shape::Sphere { center_m, .. } = ball else { unreachable!("a ball is a sphere") };
+    for (place, normal) in places(&mesh).zip(&mesh.normals) {
+        let normal = Vector3::from(normal.map(f64::from));
+        assert!((normal.norm() - 1.0).abs() < 1e-5);
+        assert!(normal.dot(&(place - center_m).normalize()) > 0.9, "{place} {normal}");
+    }
+    let off: f64 = places(&mesh)
+        .zip(&mesh.colors_srgb)
+        .map(|(place, color)| {
+            let expected = scenes::color_srgb(&place);
+            (0..3).map(|part| (f64::from(color[part]) / 255.0 - expected[part]).abs()).sum::<f64>() / 3.0
+        })
+        .sum::<f64>()
+        / mesh.positions_m.len() as f64;
+    assert!(off < 0.02, "colors are off by {off}");
+}
+
+#[test]
+fn a_slanted_wall_is_flat() {
+    let normal = Vector3::new(0.3, -0.2, 1.0).normalize();
+    let wall = Shape::Plane { normal, offset_m: 0.05 };
+    let mut model = model(scenes::options(), &scenes::ring(&[wall], Point3::origin(), 4));
+    let mut mesh = model.mesh().unwrap();
+    // Where pixels are not wider than voxels; far out they are, and slanted.
+    let is_near = places(&mesh).map(|place| place.coords.norm() < 0.8).collect::<Vec<_>>();
+    let mut near = is_near.iter();
+    mesh.positions_m.retain(|_| near.next() == Some(&true));
+    assert!(mesh.positions_m.len() > 1000);
+    let (mean_m, most_m) = errors_m(&mesh, &wall);
+    assert!(mean_m < 0.002 && most_m < 0.01, "mean {mean_m} m, most {most_m} m");
+}
+
+#[test]
+fn a_mesh_that_followed_is_the_mesh_made_at_once() {
+    let at = Point3::new(0.1, 0.0, 0.2);
+    let keyframes = scenes::ring(&[scenes::ball(at), scenes::floor()], at, 4);
+    let whole = model(scenes::options(), &keyframes).mesh().unwrap();
+    let mut followed = TsdfModel::new(Gpu::open(&GpuOptions::default()).unwrap(), scenes::options()).unwrap();
+    for keyframe in &keyframes {
+        followed.push(keyframe.clone()).unwrap();
+        while followed.step(1).unwrap() > 0 {}
+        followed.mesh().unwrap();
+    }
+    assert!(followed.mesh().unwrap() == whole);
+}
+
+#[test]
+fn clusters_are_fewer_and_stay_near() {
+    let (mesh, ball, _) = ball_mesh();
+    let coarse = mesh.clustered(0.08);
+    assert!(
+        coarse.triangles.len() * 5 < mesh.triangles.len(),
+        "{} of {}",
+        coarse.triangles.len(),
+        mesh.triangles.len()
+    );
+    assert!(!coarse.triangles.is_empty());
+    let (mean_m, _) = errors_m(&coarse, &ball);
+    assert!(mean_m < 0.01, "{mean_m} m");
+    assert!(coarse.triangles.iter().flatten().all(|ix| (*ix as usize) < coarse.positions_m.len()));
+    for cell_m in [0.0, -1.0, f64::NAN] {
+        assert!(mesh.clustered(cell_m) == mesh);
+    }
+}
+
+/// Numbers of the header, then the bytes behind it.
+fn ply_parts(bytes: &[u8]) -> (String, &[u8]) {
+    let end = bytes.windows(11).position(|window| window == b"end_header\n").unwrap() + 11;
+    (String::from_utf8(bytes[..end].to_vec()).unwrap(), &bytes[end..])
+}
+
+#[test]
+fn files_hold_the_mesh() {
+    let (mesh, _, _) = ball_mesh();
+    let folder = tempfile::tempdir().unwrap();
+    let (ply, glb) = (folder.path().join("mesh.ply"), folder.path().join("mesh.glb"));
+    write_ply(&ply, &mesh).unwrap();
+    write_glb(&glb, &mesh).unwrap();
+    let bytes = std::fs::read(ply).unwrap();
+    let (header, body) = ply_parts(&bytes);
+    assert!(header.contains(&format!("element vertex {}\n", mesh.positions_m.len())));
+    assert!(header.contains(&format!("element face {}\n", mesh.triangles.len())));
+    assert_eq!(body.len(), 27 * mesh.positions_m.len() + 13 * mesh.triangles.len());
+
+    let bytes = std::fs::read(glb).unwrap();
+    let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
+    assert_eq!((&bytes[..4], word(4), word(8)), (&b"glTF"[..], 2, bytes.len()));
+    assert_eq!(&bytes[16..20], b"JSON");
+    let json: serde_json::Value = serde_json::from_slice(&bytes[20..20 + word(12)]).unwrap();
+    let bin = 20 + word(12);
+    assert_eq!(&bytes[bin + 4..bin + 8], b"BIN\0");
+    assert_eq!(json["buffers"][0]["byteLength"], word(bin));
+    assert_eq!(bytes.len(), bin + 8 + word(bin));
+    let views = json["bufferViews"].as_array().unwrap();
+    let lengths: Vec<_> = views.iter().map(|view| view["byteLength"].as_u64().unwrap()).collect();
+    let n = mesh.positions_m.len() as u64;
+    assert_eq!(lengths, [12 * n, 12 * n, 12 * n, 12 * mesh.triangles.len() as u64]);
+    let first = bin + 8;
+    let x = f32::from_le_bytes(bytes[first..first + 4].try_into().unwrap());
+    assert_eq!(x.to_bits(), mesh.positions_m[0][0].to_bits());
+    assert_eq!(json["nodes"][1]["translation"], serde_json::json!(mesh.origin_m));
+    let empty = super::glb::to_bytes(&Mesh::default());
+    assert_eq!(u32::from_le_bytes(empty[8..12].try_into().unwrap()) as usize, empty.len());
+}

@@ -1,0 +1,25 @@
+//! Scenes as truncated signed distance fields with color: the mesh baseline, from keyframes with depth.
+//!
+//! `docs/tsdf.md` follows a depth image through the kernels.
+
+pub mod block;
+mod buffers;
+mod chosen;
+pub mod kernels;
+pub mod mesh;
+mod model;
+mod options;
+mod params;
+mod passes;
+pub mod reference;
+
+#[cfg(test)]
+mod against_twin;
+#[cfg(test)]
+mod scenes;
+#[cfg(test)]
+mod tests;
+
+pub use chosen::Lattice;
+pub use model::TsdfModel;
+pub use options::TsdfOptions;

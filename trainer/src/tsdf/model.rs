@@ -1,0 +1,482 @@
+//! The distance field as a [`Method`]: a step fuses a keyframe.
+
+mod budget;
+mod checkpoint;
+mod saving;
+
+use super::block::{Blocks, Place};
+use super::buffers::{self, Capacity, FieldBuffers};
+use super::chosen::Lattice;
+use super::kernels::Pipelines;
+use super::mesh::{Mesh, Mesher};
+use super::options::TsdfOptions;
+use super::params::{DepthFrame, status};
+use super::passes::{self, Canvas, FrameSlot};
+use crate::align::Alignment;
+use crate::checkpoint::PendingCheckpoint;
+use crate::gpu::{Gpu, PassTiming, Passes, PendingRead};
+use crate::splat::{Camera, LOW_PASS_PX2, PosedLens};
+use crate::{Error, Keyframe, Method, Part, Picture, Progress, Projection, RenderRequest, Split};
+use checkpoint::Name;
+use kinematics::Stamp;
+use std::collections::{BTreeSet, VecDeque};
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// Most keyframes of a submit: their images lie on the GPU at once.
+const FRAMES_PER_SUBMIT: usize = 4;
+/// Room at the start.
+const FIRST_CAPACITY: Capacity = Capacity { n_blocks: 4096, n_chunks: 512 };
+
+/// A colored distance field built from keyframes with depth.
+///
+/// Each keyframe is fused once, in the order they are pushed in; keyframes without depth say nothing and are passed over.
+#[derive(Debug)]
+pub struct TsdfModel {
+    gpu: Arc<Gpu>,
+    options: TsdfOptions,
+    pipelines: Pipelines,
+    lattice: Option<Lattice>,
+    field: Option<FieldBuffers>,
+    slots: Vec<FrameSlot>,
+    canvas: Option<Canvas>,
+    passes: Passes,
+    /// Not known to be fused, in order; the first of them may be in flight.
+    pending: VecDeque<Arc<Keyframe>>,
+    fused: Vec<Name>,
+    /// Keyframes that a loaded state waits for; nobody may bring them.
+    to_match: Vec<Name>,
+    in_flight: Option<InFlight>,
+    /// Blocks that found no room on the GPU.
+    waiting: Blocks,
+    /// Blocks that changed since the mesh was made.
+    due: BTreeSet<Place>,
+    mesher: Mesher,
+    n_resident: u32,
+    n_refused: u64,
+    n_outside: u32,
+    /// Frames the GPU had counted when it was last asked.
+    n_on_gpu: u32,
+    step: u64,
+    step_millis: f64,
+}
+
+#[derive(Debug)]
+struct InFlight {
+    status: PendingRead,
+    n_frames: usize,
+    since: Instant,
+}
+
+impl TsdfModel {
+    /// An empty model.
+    pub fn new(gpu: Arc<Gpu>, options: TsdfOptions) -> Result<Self, Error> {
+        Ok(Self {
+            pipelines: Pipelines::new(&gpu)?,
+            lattice: None,
+            field: None,
+            slots: Vec::new(),
+            canvas: None,
+            passes: Passes::default(),
+            pending: VecDeque::new(),
+            fused: Vec::new(),
+            to_match: Vec::new(),
+            in_flight: None,
+            waiting: Blocks::new(),
+            due: BTreeSet::new(),
+            mesher: Mesher::default(),
+            n_resident: 0,
+            n_refused: 0,
+            n_outside: 0,
+            n_on_gpu: 0,
+            step: 0,
+            step_millis: 0.0,
+            gpu,
+            options,
+        })
+    }
+
+    /// How it was asked to be built.
+    pub fn options(&self) -> &TsdfOptions {
+        &self.options
+    }
+
+    /// How finely the scene is divided; `None` before the first depth.
+    pub fn lattice(&self) -> Option<&Lattice> {
+        self.lattice.as_ref()
+    }
+
+    /// Keyframes that showed more at once than the memory allowed holds; they were left out.
+    pub fn n_refused(&self) -> u64 {
+        self.n_refused
+    }
+
+    /// Readings whose surface lay further out than blocks have places for.
+    pub fn n_outside(&self) -> u32 {
+        self.n_outside
+    }
+
+    /// Blocks that wait in host memory.
+    pub fn n_waiting(&self) -> usize {
+        self.waiting.len()
+    }
+
+    /// All blocks, in order of their places.
+    pub fn blocks(&mut self) -> Result<Blocks, Error> {
+        self.settle()?;
+        let mut blocks = self.waiting.clone();
+        if let Some(field) = &self.field {
+            blocks.extend(field.read_all(&self.gpu, &self.pipelines)?);
+        }
+        Ok(blocks)
+    }
+
+    /// The surface in world as it is now; only what changed since the last call is made anew.
+    pub fn mesh(&mut self) -> Result<Mesh, Error> {
+        self.settle()?;
+        let (Some(lattice), Some(field)) = (&self.lattice, &self.field) else { return Ok(Mesh::default()) };
+        self.due.extend(field.take_changed(&self.gpu)?);
+        let places = field.places(&self.gpu)?;
+        let slots: Vec<u32> =
+            (0..).zip(&places).filter(|(_, place)| self.due.contains(*place)).map(|(slot, _)| slot).collect();
+        let blocks = field.read(&self.gpu, &self.pipelines, &slots)?;
+        let resident = slots.iter().map(|slot| places[*slot as usize]).zip(blocks);
+        let waiting = self.due.iter().filter_map(|place| Some((*place, self.waiting.get(place)?.clone())));
+        let changed: Blocks = waiting.chain(resident).collect();
+        self.due.clear();
+        self.mesher.update(lattice, changed);
+        Ok(self.mesher.mesh(lattice))
+    }
+
+    /// Most blocks the GPU may hold.
+    fn most_blocks(&self) -> u32 {
+        let by_bytes = self.options.max_bytes.map_or(u64::MAX, |bytes| bytes / buffers::BYTES_PER_BLOCK);
+        buffers::most_blocks(&self.gpu).min(u32::try_from(by_bytes).unwrap_or(u32::MAX)).max(1)
+    }
+
+    /// Settles voxels by the first depth image that shows something; those before it are done with. False where none does.
+    fn begin(&mut self) -> Result<bool, Error> {
+        // What one binding holds is a limit as good as any.
+        let max_bytes = Some(u64::from(self.most_blocks()) * buffers::BYTES_PER_BLOCK);
+        let options = TsdfOptions { max_bytes, ..self.options.clone() };
+        while self.lattice.is_none() {
+            let Some(first) = self.pending.front() else { return Ok(false) };
+            let chosen = first.depth.as_ref().and_then(|depth| Lattice::choose(&options, depth));
+            if let Some(lattice) = chosen {
+                let n_blocks = FIRST_CAPACITY.n_blocks.min(self.most_blocks());
+                self.field = Some(FieldBuffers::new(&self.gpu, &lattice, Capacity { n_blocks, ..FIRST_CAPACITY })?);
+                self.lattice = Some(lattice);
+            } else {
+                self.pass_over();
+            }
+        }
+        Ok(!self.pending.is_empty())
+    }
+
+    /// Fuses one keyframe where none was: then there is something to show. No more than that, or looking would count as learning.
+    fn fuse_first(&mut self) -> Result<(), Error> {
+        while self.step == 0 && !self.pending.is_empty() {
+            self.step(1)?;
+        }
+        Ok(())
+    }
+
+    /// Takes the first pending keyframe for done.
+    fn pass_over(&mut self) {
+        if let Some(keyframe) = self.pending.pop_front() {
+            self.fused.push(Name::of(&keyframe));
+            self.step += 1;
+        }
+    }
+
+    /// Lists the passes of a pending keyframe.
+    fn record(&mut self, pending_ix: usize, slot_ix: usize) -> Result<(), Error> {
+        let (Some(lattice), Some(keyframe)) = (&self.lattice, self.pending.get(pending_ix)) else { return Ok(()) };
+        let Some(frame) = DepthFrame::of(keyframe, lattice) else { return Ok(()) };
+        let [n_depth, n_color] =
+            [frame.depth_size_px, frame.color_size_px].map(|[width, height]| u64::from(width) * u64::from(height));
+        if self.slots.get(slot_ix).is_none_or(|slot| !slot.holds(n_depth, n_color)) {
+            self.passes.forget_bindings();
+            let slot = FrameSlot::new(&self.gpu, n_depth, n_color)?;
+            self.slots.truncate(slot_ix);
+            self.slots.push(slot);
+        }
+        let slot = &mut self.slots[slot_ix];
+        slot.upload(&self.gpu, keyframe, &frame);
+        if let Some(field) = &self.field {
+            passes::fuse(&self.gpu, &mut self.passes, &self.pipelines, field, slot);
+        }
+        Ok(())
+    }
+
+    /// Waits for the submit in flight and takes note of what it did; says whether something found no room.
+    fn settle(&mut self) -> Result<bool, Error> {
+        let Some(in_flight) = self.in_flight.take() else { return Ok(false) };
+        let counters: Vec<u32> = in_flight.status.finish(&self.gpu)?;
+        let millis = in_flight.since.elapsed().as_secs_f64() * 1e3 / in_flight.n_frames.max(1) as f64;
+        self.step_millis = if self.step_millis == 0.0 { millis } else { 0.8 * self.step_millis + 0.2 * millis };
+        self.take_note(&counters)
+    }
+
+    /// Counts what was fused; makes room where there was none and says so.
+    fn take_note(&mut self, counters: &[u32]) -> Result<bool, Error> {
+        for _ in 0..counters[status::N_FRAMES].wrapping_sub(self.n_on_gpu) {
+            self.pass_over();
+        }
+        self.n_on_gpu = counters[status::N_FRAMES];
+        self.n_outside = counters[status::N_OUTSIDE];
+        self.n_resident = counters[status::N_BLOCKS];
+        let failed = counters[status::STOPPED] != 0;
+        if failed {
+            self.make_room(counters)?;
+            self.n_resident = self.field.as_ref().map_or(Ok(0), |field| field.n_blocks(&self.gpu))?;
+        }
+        Ok(failed)
+    }
+
+    /// Gives a field that was too small more room, on the GPU or by sending blocks to wait.
+    fn make_room(&mut self, counters: &[u32]) -> Result<(), Error> {
+        let (Some(lattice), Some(field)) = (&self.lattice, &self.field) else { return Ok(()) };
+        let mut capacity = field.capacity;
+        let (need, most) = (counters[status::N_BLOCKS], self.most_blocks());
+        if counters[status::TABLE_FULL] != 0 {
+            capacity.n_chunks *= 2;
+        }
+        if need > capacity.n_blocks {
+            capacity.n_blocks = need.max(capacity.n_blocks.saturating_add(capacity.n_blocks / 2)).min(most);
+        }
+        if capacity != field.capacity {
+            log::debug!("tsdf: room for {capacity:?}");
+            let resized = field.resized(&self.gpu, &self.pipelines, lattice, capacity)?;
+            self.passes.forget_bindings();
+            self.field = Some(resized);
+        }
+        if need > most { self.send_away(need - most) } else { Ok(()) }
+    }
+
+    /// Draws one pinhole view.
+    fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3]) -> Result<Picture, Error> {
+        if !self.record_picture(camera, background_srgb)? {
+            return Ok(empty_picture(camera.size_px, background_srgb));
+        }
+        self.passes.submit(&self.gpu);
+        let canvas = self.canvas.as_ref().ok_or(Error::DeviceLost)?;
+        let n = camera.size_px[0] as usize * camera.size_px[1] as usize;
+        let pixels: Vec<u32> = self.gpu.read(&canvas.pixels, n)?;
+        let depth_m = self.gpu.read(&canvas.depths, n)?;
+        Ok(Picture { size_px: camera.size_px, rgba_srgb: bytemuck::cast_slice(&pixels).to_vec(), depth_m })
+    }
+
+    /// GPU time of a pinhole picture, milliseconds, without bringing it to the host; `None` where the adapter tells none.
+    pub fn profile_picture(&mut self, request: &RenderRequest) -> Result<Option<f64>, Error> {
+        self.settle()?;
+        let Projection::Pinhole { focal_px, principal_px } = request.projection else { return Ok(None) };
+        if !self.record_picture(&camera_of(request, focal_px, principal_px), request.background_srgb)? {
+            return Ok(None);
+        }
+        self.passes.submit_spanned(&self.gpu)
+    }
+
+    /// Lists what a picture takes; false where there is nothing to draw.
+    fn record_picture(&mut self, camera: &Camera, background_srgb: [f32; 3]) -> Result<bool, Error> {
+        let [width, height] = camera.size_px;
+        let n = u64::from(width) * u64::from(height);
+        let Some(lattice) = self.lattice.clone().filter(|_| self.field.is_some()) else { return Ok(false) };
+        let in_field = in_field(camera, &lattice);
+        self.bring_for(&in_field)?;
+        if self.canvas.as_ref().is_none_or(|canvas| canvas.n_pixels < n) {
+            self.passes.forget_bindings();
+            self.canvas = None;
+            self.canvas = Some(Canvas::new(&self.gpu, n)?);
+        }
+        let (Some(field), Some(canvas)) = (&self.field, &self.canvas) else { return Err(Error::DeviceLost) };
+        canvas.aim(&self.gpu, &in_field.view(), background_srgb);
+        passes::draw(&self.gpu, &mut self.passes, &self.pipelines, field, canvas, camera.size_px);
+        Ok(true)
+    }
+}
+
+/// The camera that a picture is asked from.
+fn camera_of(request: &RenderRequest, focal_px: [f64; 2], principal_px: [f64; 2]) -> Camera {
+    Camera {
+        world_from_camera: request.world_from_camera,
+        size_px: request.size_px,
+        focal_px,
+        principal_px,
+        shutter: request.shutter,
+        near_m: request.near_m,
+        far_m: request.far_m,
+        crop: request.crop,
+        low_pass_px2: LOW_PASS_PX2,
+    }
+}
+
+/// The camera, and what it is cropped to, in the field's frame.
+fn in_field(camera: &Camera, lattice: &Lattice) -> Camera {
+    let field_from_world = lattice.field_from_world();
+    let mut camera = camera.clone();
+    camera.world_from_camera = field_from_world * camera.world_from_camera;
+    if let Some(crop) = &mut camera.crop {
+        crop.world_from_box = field_from_world * crop.world_from_box;
+    }
+    camera
+}
+
+/// A picture of nothing.
+fn empty_picture(size_px: [u32; 2], background_srgb: [f32; 3]) -> Picture {
+    let n = size_px[0] as usize * size_px[1] as usize;
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to 0 to 255")]
+    let [red, green, blue] = background_srgb.map(|part| (part.clamp(0.0, 1.0) * 255.0 + 0.5).floor() as u8);
+    Picture { size_px, rgba_srgb: [red, green, blue, 0].repeat(n), depth_m: vec![0.0; n] }
+}
+
+/// Refuses arrays that do not have their pixels.
+fn check(keyframe: &Keyframe) -> Result<(), Error> {
+    let [width, height] = keyframe.size_px;
+    let expected = 4 * width as usize * height as usize;
+    if keyframe.rgba_srgb.len() != expected {
+        return Err(Error::PictureBytes { what: "keyframe", width, height, got: keyframe.rgba_srgb.len(), expected });
+    }
+    let Some(depth) = &keyframe.depth else { return Ok(()) };
+    let expected = depth.size_px[0] as usize * depth.size_px[1] as usize;
+    if depth.depth_m.len() != expected {
+        return Err(Error::DepthSize { rendered: depth.depth_m.len(), truth: expected });
+    }
+    Ok(())
+}
+
+impl Method for TsdfModel {
+    fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
+        if keyframe.split == Split::Test || keyframe.depth.is_none() {
+            return Ok(());
+        }
+        check(&keyframe)?;
+        self.pending.push_back(keyframe);
+        Ok(())
+    }
+
+    /// A keyframe that was not fused yet is forgotten. What was fused stays: sums do not tell who gave what; it fades as
+    /// others look at the same place.
+    fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
+        self.settle()?;
+        self.pending.retain(|keyframe| keyframe.camera.as_ref() != camera || keyframe.stamp != stamp);
+        Ok(())
+    }
+
+    fn step(&mut self, n: u64) -> Result<u64, Error> {
+        let before = self.step;
+        if !self.begin()? {
+            self.settle()?;
+            return Ok(self.step - before);
+        }
+        if !self.waiting.is_empty() {
+            self.settle()?;
+            return self.step_within_budget(n);
+        }
+        let n_in_flight = self.in_flight.as_ref().map_or(0, |in_flight| in_flight.n_frames);
+        let n_left = (self.pending.len() - n_in_flight.min(self.pending.len())) as u64;
+        let n_frames = usize::try_from(n.min(n_left)).unwrap_or(usize::MAX).min(FRAMES_PER_SUBMIT);
+        if n_frames == 0 {
+            self.settle()?;
+            return Ok(self.step - before);
+        }
+        let since = Instant::now();
+        for ix in 0..n_frames {
+            self.record(n_in_flight + ix, ix)?;
+        }
+        self.passes.submit(&self.gpu);
+        let field = self.field.as_ref().ok_or(Error::DeviceLost)?;
+        let status = self.gpu.begin_read(&field.status, status::LEN);
+        let failed = self.settle()?; // The submit before; this one runs meanwhile.
+        if !failed {
+            self.in_flight = Some(InFlight { status, n_frames, since });
+        } // Else this one found the failure too and did nothing.
+        if n_frames as u64 == n || n_frames as u64 == n_left {
+            self.settle()?; // The caller stops here: the count must be true.
+        }
+        Ok(n_frames as u64)
+    }
+
+    fn is_idle(&self) -> bool {
+        self.pending.is_empty()
+    }
+
+    fn primitive(&self) -> &'static str {
+        "block"
+    }
+
+    fn n_taken(&mut self) -> Result<u64, Error> {
+        self.settle()?;
+        Ok(self.step)
+    }
+
+    fn seed(&mut self) -> Result<(), Error> {
+        self.settle()?;
+        while !self.pending.is_empty() {
+            self.step(self.pending.len() as u64)?;
+            self.settle()?;
+        }
+        Ok(())
+    }
+
+    fn prepare(&mut self) -> Result<(), Error> {
+        Ok(())
+    }
+
+    fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
+        self.settle()?;
+        self.fuse_first()?;
+        match request.projection {
+            Projection::Pinhole { focal_px, principal_px } => {
+                let camera = camera_of(request, focal_px, principal_px);
+                self.draw_view(&camera, request.background_srgb)
+            }
+            Projection::Equirectangular => {
+                crate::splat::equirect::render(request, |camera| self.draw_view(camera, request.background_srgb))
+            }
+        }
+    }
+
+    fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {
+        Ok(PosedLens::of(keyframe))
+    }
+
+    fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
+        self.settle()?;
+        if !self.begin()? {
+            return Ok(Vec::new());
+        }
+        self.record(0, 0)?;
+        let timings = self.passes.submit_timed(&self.gpu)?;
+        let field = self.field.as_ref().ok_or(Error::DeviceLost)?;
+        let counters = field.counters(&self.gpu)?;
+        self.take_note(&counters)?;
+        Ok(timings)
+    }
+
+    fn alignment(&self) -> Option<&Alignment> {
+        None
+    }
+
+    fn progress(&self) -> Progress {
+        Progress {
+            step: self.step,
+            primitives: u64::from(self.n_resident) + self.waiting.len() as u64,
+            bytes: self.field.as_ref().map_or(0, |field| field.bytes(self.n_resident.into())),
+            step_millis: self.step_millis,
+        }
+    }
+
+    fn report(&self) -> Vec<Part> {
+        Vec::new()
+    }
+
+    fn save(&mut self, folder: &Path) -> Result<(), Error> {
+        self.write_folder(folder)
+    }
+
+    fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
+        self.take_checkpoint()
+    }
+}

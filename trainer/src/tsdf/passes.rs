@@ -1,0 +1,196 @@
+//! What a frame, a picture and a rebuilt table take, as lists of passes.
+
+use super::buffers::FieldBuffers;
+use super::kernels::Pipelines;
+use super::params::{Backdrop, DepthFrame};
+use crate::gpu::{Buffer, Gpu, Passes};
+use crate::splat::View;
+use crate::{Error, Keyframe};
+
+/// Most workgroups that share the visible blocks: enough to fill any GPU.
+const MAX_INTEGRATE_GROUPS: u32 = 8192;
+
+/// One keyframe on the GPU, and what is made of its depth.
+#[derive(Debug)]
+pub(crate) struct FrameSlot {
+    frame: Buffer,
+    depth: Buffer,
+    image: Buffer,
+    readings: Buffer,
+    n_pixels: u64,
+}
+
+impl FrameSlot {
+    /// Room for images like these.
+    pub(crate) fn new(gpu: &Gpu, n_depth_pixels: u64, n_color_pixels: u64) -> Result<Self, Error> {
+        Ok(Self {
+            frame: gpu.uniform_with("tsdf.frame", &<DepthFrame as bytemuck::Zeroable>::zeroed()),
+            depth: gpu.storage("tsdf.depth", 4 * n_depth_pixels)?,
+            image: gpu.storage("tsdf.image", 4 * n_color_pixels)?,
+            readings: gpu.storage("tsdf.readings", 8 * n_depth_pixels)?,
+            n_pixels: 0,
+        })
+    }
+
+    /// Whether the images of a keyframe fit.
+    pub(crate) fn holds(&self, n_depth_pixels: u64, n_color_pixels: u64) -> bool {
+        self.depth.bytes() >= 4 * n_depth_pixels && self.image.bytes() >= 4 * n_color_pixels
+    }
+
+    /// Takes a keyframe's images; they must fit.
+    pub(crate) fn upload(&mut self, gpu: &Gpu, keyframe: &Keyframe, frame: &DepthFrame) {
+        let Some(depth) = &keyframe.depth else { return };
+        gpu.write(&self.frame, 0, bytemuck::bytes_of(frame));
+        gpu.write(&self.depth, 0, bytemuck::cast_slice(&depth.depth_m));
+        gpu.write(&self.image, 0, &keyframe.rgba_srgb);
+        self.n_pixels = depth.depth_m.len() as u64;
+    }
+
+    #[cfg(test)]
+    pub(super) fn readings(&self) -> &Buffer {
+        &self.readings
+    }
+}
+
+/// Fuses a frame.
+pub(crate) fn fuse(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers: &FieldBuffers, slot: &FrameSlot) {
+    let FieldBuffers { capacity, field, status, keys, entries, coords, geometry, colors, changed, visible } = buffers;
+    let FrameSlot { frame, depth, image, readings, n_pixels } = slot;
+    let n_groups = n_pixels.div_ceil(64);
+    list.dispatch(
+        gpu,
+        &pipelines.readings,
+        n_groups,
+        &[("field", field), ("frame", frame), ("depth", depth), ("readings", readings)],
+    );
+    list.dispatch(
+        gpu,
+        &pipelines.allocate_blocks,
+        n_groups,
+        &[
+            ("field", field),
+            ("frame", frame),
+            ("readings", readings),
+            ("status", status),
+            ("keys", keys),
+            ("entries", entries),
+            ("coords", coords),
+        ],
+    );
+    list.dispatch(
+        gpu,
+        &pipelines.find_visible,
+        u64::from(capacity.n_blocks).div_ceil(64),
+        &[("field", field), ("frame", frame), ("coords", coords), ("status", status), ("visible", visible)],
+    );
+    list.dispatch(
+        gpu,
+        &pipelines.integrate,
+        capacity.n_blocks.min(MAX_INTEGRATE_GROUPS).into(),
+        &[
+            ("field", field),
+            ("frame", frame),
+            ("readings", readings),
+            ("image", image),
+            ("coords", coords),
+            ("visible", visible),
+            ("status", status),
+            ("geometry", geometry),
+            ("colors", colors),
+            ("changed", changed),
+        ],
+    );
+    list.dispatch(gpu, &pipelines.end_frame, 1, &[("status", status)]);
+}
+
+/// Enters the first `n` blocks into the empty table.
+pub(crate) fn index(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers: &FieldBuffers, n: u32) {
+    let FieldBuffers { field, status, keys, entries, coords, .. } = buffers;
+    list.dispatch(
+        gpu,
+        &pipelines.index_blocks,
+        u64::from(n).div_ceil(64),
+        &[("field", field), ("coords", coords), ("status", status), ("keys", keys), ("entries", entries)],
+    );
+}
+
+/// Copies `n` listed blocks to the front of other buffers.
+pub(crate) fn gather(
+    gpu: &Gpu,
+    list: &mut Passes,
+    pipelines: &Pipelines,
+    buffers: &FieldBuffers,
+    listed: &Buffer,
+    (geometry, colors): (&Buffer, &Buffer),
+    n: usize,
+) {
+    list.dispatch(
+        gpu,
+        &pipelines.gather_blocks,
+        n as u64,
+        &[
+            ("listed", listed),
+            ("geometry", &buffers.geometry),
+            ("colors", &buffers.colors),
+            ("gathered_geometry", geometry),
+            ("gathered_colors", colors),
+        ],
+    );
+}
+
+/// A picture and where it is drawn.
+#[derive(Debug)]
+pub(crate) struct Canvas {
+    view: Buffer,
+    backdrop: Buffer,
+    pub(crate) pixels: Buffer,
+    pub(crate) depths: Buffer,
+    pub(crate) n_pixels: u64,
+}
+
+impl Canvas {
+    pub(crate) fn new(gpu: &Gpu, n_pixels: u64) -> Result<Self, Error> {
+        Ok(Self {
+            view: gpu.uniform_with("tsdf.view", &<View as bytemuck::Zeroable>::zeroed()),
+            backdrop: gpu.uniform_with("tsdf.backdrop", &<Backdrop as bytemuck::Zeroable>::zeroed()),
+            pixels: gpu.storage("tsdf.pixels", 4 * n_pixels)?,
+            depths: gpu.storage("tsdf.depths", 4 * n_pixels)?,
+            n_pixels,
+        })
+    }
+
+    pub(crate) fn aim(&self, gpu: &Gpu, view: &View, background_srgb: [f32; 3]) {
+        let [red, green, blue] = background_srgb;
+        gpu.write(&self.view, 0, bytemuck::bytes_of(view));
+        gpu.write(&self.backdrop, 0, bytemuck::bytes_of(&Backdrop { srgb: [red, green, blue, 0.0] }));
+    }
+}
+
+/// Draws what the canvas is aimed at.
+pub(crate) fn draw(
+    gpu: &Gpu,
+    list: &mut Passes,
+    pipelines: &Pipelines,
+    buffers: &FieldBuffers,
+    canvas: &Canvas,
+    size_px: [u32; 2],
+) {
+    let [columns, rows] = size_px.map(|size| u64::from(size.div_ceil(8)));
+    list.dispatch(
+        gpu,
+        &pipelines.cast_rays,
+        columns * rows,
+        &[
+            ("view", &canvas.view),
+            ("field", &buffers.field),
+            ("backdrop", &canvas.backdrop),
+            ("status", &buffers.status),
+            ("keys", &buffers.keys),
+            ("entries", &buffers.entries),
+            ("geometry", &buffers.geometry),
+            ("colors", &buffers.colors),
+            ("pixels", &canvas.pixels),
+            ("depths", &canvas.depths),
+        ],
+    );
+}

@@ -1,0 +1,67 @@
+// readings: which pixels of a depth image are to be believed, and how their surface is turned.
+//
+// threads   one per pixel of the depth image
+// reads     field, frame, depth [n_pixels] (bits of metres along z)
+// writes    readings [n_pixels]: depth in metres, 0 where it is not to be believed; and the ray with z = 1 times the
+//           surface's unit normal, so that a difference in z times it is a distance along the normal
+// twin      tsdf/reference/readings.rs
+// source    normals by differences: Newcombe et al. 2011 (KinectFusion), section 3.2; the limit on slopes is ours
+
+#import field
+#import depth_frame
+
+@group(0) @binding(0) var<uniform> field: Field;
+@group(0) @binding(1) var<uniform> frame: DepthFrame;
+@group(0) @binding(2) var<storage, read> depth: array<u32>;
+@group(0) @binding(3) var<storage, read_write> readings: array<vec2f>;
+
+const MIN_DEPTH_M = 0.01;
+// Steepest surface that is believed, as change of depth over distance across: steeper ones are edges.
+const MAX_SLOPE = 6.0;
+
+// 0 where there is none. Finiteness is tested on the bits: the compiler may assume there is no NaN.
+fn depth_at(pixel: vec2i) -> f32 {
+    if any(pixel < vec2i(0)) || any(pixel >= vec2i(frame.depth_size_px)) { return 0.0; }
+    let bits = depth[u32(pixel.y) * frame.depth_size_px.x + u32(pixel.x)];
+    if bits == 0u || bits >= 0x7f800000u { return 0.0; } // Zero, negative, infinite or no number.
+    let depth_m = bitcast<f32>(bits);
+    return select(0.0, depth_m, depth_m >= MIN_DEPTH_M && depth_m <= field.max_depth_m);
+}
+
+fn point_at(pixel: vec2i, depth_m: f32) -> vec3f {
+    return ray_of(frame, vec2f(pixel) + 0.5) * depth_m;
+}
+
+struct Side {
+    seen: bool,
+    edge: bool,
+    along: vec3f,             // change of the point per pixel
+}
+
+fn beside(pixel: vec2i, step: vec2i, center_m: f32, focal_px: f32) -> Side {
+    let high_m = depth_at(pixel + step);
+    let low_m = depth_at(pixel - step);
+    let limit = MAX_SLOPE * center_m / focal_px + 6.0 * field.noise_per_m2 * center_m * center_m;
+    let has_high = high_m > 0.0;
+    let has_low = low_m > 0.0;
+    let edge = (has_high && abs(high_m - center_m) > limit) || (has_low && abs(low_m - center_m) > limit);
+    let high = point_at(pixel + select(vec2i(0), step, has_high), select(center_m, high_m, has_high));
+    let low = point_at(pixel - select(vec2i(0), step, has_low), select(center_m, low_m, has_low));
+    return Side(has_high || has_low, edge, high - low);
+}
+
+override WG_SIZE = 64u;
+@compute @workgroup_size(WG_SIZE)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let at = folded(wg, n_wgs) * WG_SIZE + lane;
+    if at >= frame.depth_size_px.x * frame.depth_size_px.y { return; } // Allowed here: no barrier below.
+    let pixel = vec2i(vec2u(at % frame.depth_size_px.x, at / frame.depth_size_px.x));
+    let center_m = depth_at(pixel);
+    let x = beside(pixel, vec2i(1, 0), center_m, frame.depth_focal_px.x);
+    let y = beside(pixel, vec2i(0, 1), center_m, frame.depth_focal_px.y);
+    let normal = cross(x.along, y.along);
+    let ray = ray_of(frame, vec2f(pixel) + 0.5);
+    let turned = dot(ray, normal) / max(length(normal), 1e-30);
+    let believed = center_m > 0.0 && x.seen && y.seen && !x.edge && !y.edge && turned > 0.0;
+    readings[at] = select(vec2f(0.0), vec2f(center_m, turned), believed);
+}

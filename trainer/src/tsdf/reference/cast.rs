@@ -1,0 +1,76 @@
+//! Twin of `cast_rays.wgsl`: the first crossing from outside to inside, found by small even steps.
+
+use crate::tsdf::block::{Blocks, block_of, voxel_ix};
+use crate::tsdf::chosen::Lattice;
+use nalgebra::{Point3, Vector3};
+
+/// Length of a step, voxels: short, because nothing is clever here.
+const STEP_VOXELS: f64 = 0.05;
+
+/// A ray in the field's frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ray {
+    /// Where it begins, metres from the anchor.
+    pub origin_m: Point3<f64>,
+    /// Change per metre of depth.
+    pub along: Vector3<f64>,
+    /// Depths between which a surface is looked for, metres.
+    pub range_m: [f64; 2],
+}
+
+/// Where a ray meets the surface.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Hit {
+    /// Depth, metres.
+    pub depth_m: f64,
+    /// sRGB, 0 to 1.
+    pub color_srgb: [f64; 3],
+}
+
+/// The first surface along the ray that faces its origin.
+pub fn cast(blocks: &Blocks, lattice: &Lattice, ray: &Ray) -> Option<Hit> {
+    let at = |depth_m: f64| (ray.origin_m + ray.along * depth_m).coords / lattice.voxel_m;
+    let step_m = STEP_VOXELS * lattice.voxel_m / ray.along.norm();
+    let mut depth_m = ray.range_m[0];
+    let mut before: Option<(f64, f64)> = None;
+    while depth_m < ray.range_m[1] {
+        let here = distance_at(blocks, &at(depth_m));
+        if let (Some((outside_m, outside)), Some(inside)) = (before, here.filter(|distance| *distance < 0.0)) {
+            let hit_m = outside_m + (depth_m - outside_m) * outside / (outside - inside);
+            return Some(Hit { depth_m: hit_m, color_srgb: color_at(blocks, &at(hit_m)) });
+        }
+        before = here.filter(|distance| *distance >= 0.0).map(|distance| (depth_m, distance));
+        depth_m += step_m;
+    }
+    None
+}
+
+/// Eight voxels around a point given in voxels, and their shares.
+#[expect(clippy::cast_possible_truncation, reason = "places are rounded down on purpose")]
+fn around(point: &Vector3<f64>) -> impl Iterator<Item = ([i32; 3], f64)> {
+    let corner = point.map(|along| (along - 0.5).floor());
+    let share = point.map(|along| along - 0.5) - corner;
+    (0..8usize).map(move |ix| {
+        let is_next = |axis: usize| ix >> axis & 1 == 1;
+        let part = (0..3).map(|axis| if is_next(axis) { share[axis] } else { 1.0 - share[axis] }).product();
+        (std::array::from_fn(|axis| corner[axis] as i32 + i32::from(is_next(axis))), part)
+    })
+}
+
+/// Distance as a share of the field's scale; `None` where one of the eight voxels was not seen.
+fn distance_at(blocks: &Blocks, point: &Vector3<f64>) -> Option<f64> {
+    around(point)
+        .try_fold(0.0, |sum, (voxel, part)| Some(sum + part * blocks.get(&block_of(voxel))?.distance(voxel_ix(voxel))?))
+}
+
+fn color_at(blocks: &Blocks, point: &Vector3<f64>) -> [f64; 3] {
+    let (mut sum, mut weight) = (Vector3::zeros(), 0.0);
+    for (voxel, part) in around(point) {
+        let color = blocks.get(&block_of(voxel)).and_then(|block| block.color_srgb(voxel_ix(voxel)));
+        if let Some(color) = color {
+            sum += Vector3::from(color) * part;
+            weight += part;
+        }
+    }
+    if weight > 1e-6 { (sum / weight).into() } else { [0.5; 3] }
+}

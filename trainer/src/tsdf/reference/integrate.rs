@@ -1,0 +1,144 @@
+//! Twin of `integrate.wgsl`, on all blocks given: those the camera does not see it leaves as they are.
+
+use super::readings::{Reading, ray_of};
+use crate::tsdf::block::{N_VOXELS, Place};
+use crate::tsdf::chosen::Lattice;
+use crate::{DepthMap, Keyframe};
+use nalgebra::{Point3, Vector3};
+use std::collections::BTreeMap;
+
+/// What is known of a voxel.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Voxel {
+    /// Signed distance to the surface, metres.
+    pub distance_m: f64,
+    /// In 256ths, whole; 0: not seen.
+    pub weight: f64,
+    /// sRGB, 0 to 1.
+    pub color_srgb: [f64; 3],
+    /// In 256ths, whole.
+    pub color_weight: f64,
+}
+
+/// Voxels of blocks, x fastest.
+pub type VoxelBlocks = BTreeMap<Place, Vec<Voxel>>;
+
+const MIN_TURNED: f64 = 0.3;
+const CARVING: f64 = 4.0;
+const COLOR_VOXELS: f64 = 2.0;
+
+/// Fuses a keyframe with depth into the blocks given.
+pub fn integrate(blocks: &mut VoxelBlocks, keyframe: &Keyframe, readings: &[Reading], lattice: &Lattice) {
+    let Some(depth) = &keyframe.depth else { return };
+    for (place, voxels) in blocks {
+        debug_assert_eq!(voxels.len(), N_VOXELS, "a block has all its voxels");
+        for (ix, voxel) in voxels.iter_mut().enumerate() {
+            let offset = [ix % 8, ix / 8 % 8, ix / 64];
+            let along = |axis: usize| (f64::from(8 * place[axis]) + offset[axis] as f64 + 0.5) * lattice.voxel_m;
+            let in_field = Point3::new(along(0), along(1), along(2));
+            let in_world = lattice.field_from_world().inverse() * in_field;
+            fuse(voxel, keyframe, depth, readings, lattice, &in_world);
+        }
+    }
+}
+
+fn fuse(
+    voxel: &mut Voxel,
+    keyframe: &Keyframe,
+    depth: &DepthMap,
+    readings: &[Reading],
+    lattice: &Lattice,
+    in_world: &Point3<f64>,
+) {
+    let point = depth.world_from_camera.inverse() * in_world;
+    let Some(place_px) = projected(&point, depth.focal_px, depth.principal_px, depth.size_px) else { return };
+    let reading = reading_near(depth, readings, place_px);
+    if reading.depth_m <= 0.0 {
+        return;
+    }
+    let distance_m = (reading.depth_m - point.z) * reading.turned.max(MIN_TURNED);
+    let truncation_m = lattice.truncation_at(reading.depth_m);
+    let ray_m = ray_of(depth, place_px).norm();
+    let behind_m = (point.z - reading.depth_m) * ray_m;
+    if behind_m > truncation_m {
+        return;
+    }
+    let nearness = (1.0 / (reading.depth_m * reading.depth_m)).min(1.0);
+    let behind = ((truncation_m - behind_m) / (truncation_m - lattice.voxel_m)).clamp(0.0, 1.0);
+    let gain = nearness * (reading.turned / ray_m).powi(2) * behind;
+    if distance_m > truncation_m {
+        if voxel.weight > 0.0 && voxel.distance_m < 0.0 {
+            let lost = (CARVING * 256.0 * (1.0 / (point.z * point.z)).min(1.0) + 0.5).floor().max(1.0);
+            if lost >= voxel.weight {
+                (voxel.distance_m, voxel.weight) = (0.0, 0.0);
+            } else {
+                voxel.weight -= lost;
+            }
+        }
+        return;
+    }
+    let gained = (256.0 * gain + 0.5).floor().clamp(1.0, 256.0);
+    let sum = voxel.weight + gained;
+    voxel.distance_m = (voxel.distance_m * voxel.weight + distance_m * gained) / sum;
+    voxel.weight = sum.min(f64::from(lattice.max_weight));
+    if distance_m.abs() <= COLOR_VOXELS * lattice.voxel_m {
+        fuse_color(voxel, keyframe, gained, f64::from(lattice.max_weight), in_world);
+    }
+}
+
+fn fuse_color(voxel: &mut Voxel, keyframe: &Keyframe, gained: f64, max_weight: f64, in_world: &Point3<f64>) {
+    let point = keyframe.world_from_camera.inverse() * in_world;
+    let Some(place_px) = projected(&point, keyframe.focal_px, keyframe.principal_px, keyframe.size_px) else { return };
+    let [red, green, blue, alpha] = color_near(keyframe, place_px);
+    if alpha <= 0.999 {
+        return;
+    }
+    let sum = voxel.color_weight + gained;
+    for (had, seen) in voxel.color_srgb.iter_mut().zip([red, green, blue]) {
+        *had = (*had * voxel.color_weight + seen * gained) / sum;
+    }
+    voxel.color_weight = sum.min(max_weight);
+}
+
+fn projected(point: &Point3<f64>, focal: [f64; 2], principal: [f64; 2], size_px: [u32; 2]) -> Option<[f64; 2]> {
+    let place: [f64; 2] = std::array::from_fn(|axis| focal[axis] * point[axis] / point.z + principal[axis]);
+    let inside = (0..2).all(|axis| place[axis] >= 0.0 && place[axis] < f64::from(size_px[axis]));
+    (point.z > 0.0 && inside).then_some(place)
+}
+
+/// The four pixels around a place, clamped to the image, and the shares of the right and the lower ones.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the image")]
+fn corners(place_px: [f64; 2], size_px: [u32; 2]) -> ([usize; 4], [f64; 2]) {
+    let base = place_px.map(|along| (along - 0.5).floor());
+    let clamped = |axis: usize, step: f64| (base[axis] + step).clamp(0.0, f64::from(size_px[axis]) - 1.0) as usize;
+    let at = |x: f64, y: f64| clamped(1, y) * size_px[0] as usize + clamped(0, x);
+    ([at(0.0, 0.0), at(1.0, 0.0), at(0.0, 1.0), at(1.0, 1.0)], [0, 1].map(|axis| place_px[axis] - 0.5 - base[axis]))
+}
+
+fn mixed(values: [f64; 4], share: [f64; 2]) -> f64 {
+    let mix = |a: f64, b: f64, share: f64| a * (1.0 - share) + b * share;
+    mix(mix(values[0], values[1], share[0]), mix(values[2], values[3], share[0]), share[1])
+}
+
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a place inside the image")]
+fn reading_near(depth: &DepthMap, readings: &[Reading], place_px: [f64; 2]) -> Reading {
+    let (at, share) = corners(place_px, depth.size_px);
+    let four = at.map(|ix| readings[ix]);
+    if four.iter().any(|reading| reading.depth_m <= 0.0) {
+        return readings[place_px[1] as usize * depth.size_px[0] as usize + place_px[0] as usize];
+    }
+    Reading {
+        depth_m: mixed(four.map(|reading| reading.depth_m), share),
+        turned: mixed(four.map(|reading| reading.turned), share),
+    }
+}
+
+fn color_near(keyframe: &Keyframe, place_px: [f64; 2]) -> [f64; 4] {
+    let (at, share) = corners(place_px, keyframe.size_px);
+    std::array::from_fn(|part| mixed(at.map(|ix| f64::from(keyframe.rgba_srgb[4 * ix + part]) / 255.0), share))
+}
+
+/// Voxels that nobody has seen.
+pub fn unseen() -> Vec<Voxel> {
+    vec![Voxel { color_srgb: Vector3::zeros().into(), ..Voxel::default() }; N_VOXELS]
+}

@@ -1,0 +1,11 @@
+//! What the kernels do, in f64 and without regard to speed.
+
+mod allocate;
+mod cast;
+mod integrate;
+mod readings;
+
+pub use allocate::{Wanted, wanted_blocks};
+pub use cast::{Hit, Ray, cast};
+pub use integrate::{Voxel, VoxelBlocks, integrate, unseen};
+pub use readings::{Reading, readings};

@@ -1,0 +1,190 @@
+//! Scenes of known shape, and exact keyframes of them.
+
+use super::TsdfOptions;
+use crate::gpu::f32_of;
+use crate::{DepthMap, Keyframe, Projection, RenderRequest, Split};
+use kinematics::{Stamp, Transform};
+use nalgebra::{Point3, UnitQuaternion, Vector3};
+use std::f64::consts::PI;
+use std::sync::Arc;
+
+pub(super) const SIZE_PX: [u32; 2] = [96, 80];
+pub(super) const FOCAL_PX: [f64; 2] = [90.0, 88.0];
+pub(super) const PRINCIPAL_PX: [f64; 2] = [47.0, 41.5];
+
+/// A thing with a surface.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Shape {
+    Sphere {
+        center_m: Point3<f64>,
+        radius_m: f64,
+    },
+    /// Points whose dot product with the unit normal is the offset.
+    Plane {
+        normal: Vector3<f64>,
+        offset_m: f64,
+    },
+}
+
+impl Shape {
+    /// Depth along z of the first surface on the ray, in a frame moved to `camera`.
+    fn depth_m(&self, origin: &Point3<f64>, along: &Vector3<f64>) -> Option<f64> {
+        let depth_m = match self {
+            Self::Sphere { center_m, radius_m } => {
+                let from = origin - center_m;
+                let (a, b) = (along.norm_squared(), along.dot(&from));
+                let root = b * b - a * (from.norm_squared() - radius_m * radius_m);
+                (root >= 0.0).then(|| (-b - root.sqrt()) / a)?
+            }
+            Self::Plane { normal, offset_m } => (offset_m - normal.dot(&origin.coords)) / normal.dot(along),
+        };
+        (depth_m > 0.0).then_some(depth_m)
+    }
+
+    /// Distance to the surface, outside positive for spheres; without sign for planes.
+    pub(super) fn distance_m(&self, point: &Point3<f64>) -> f64 {
+        match self {
+            Self::Sphere { center_m, radius_m } => (point - center_m).norm() - radius_m,
+            Self::Plane { normal, offset_m } => (normal.dot(&point.coords) - offset_m).abs(),
+        }
+    }
+}
+
+/// Color that the world has at a point.
+pub(super) fn color_srgb(point: &Point3<f64>) -> [f64; 3] {
+    [0, 1, 2].map(|axis| 0.5 + 0.4 * (3.0 * point[axis] + axis as f64).sin())
+}
+
+/// A camera at `eye` that looks at `target`, z up.
+pub(super) fn looking(eye: Point3<f64>, target: Point3<f64>) -> Transform {
+    let up = if (target - eye).xy().norm() < 1e-9 { Vector3::y() } else { Vector3::z() };
+    Transform::face_towards(&eye, &target, &up) * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), PI)
+}
+
+/// What a camera sees of the shapes: exact depth and color.
+pub(super) fn keyframe(ix: i64, shapes: &[Shape], world_from_camera: Transform) -> Keyframe {
+    // The color camera sits 4 cm beside the depth camera and has another size.
+    let color_pose = world_from_camera * Transform::translation(0.04, 0.0, 0.0);
+    let depth_m: Vec<f32> = seen(shapes, &world_from_camera, SIZE_PX, FOCAL_PX, PRINCIPAL_PX)
+        .map(|hit| hit.map_or(0.0, |(depth, _)| f32_of(depth)))
+        .collect();
+    let color_size = [120, 100];
+    let (color_focal, color_principal) = ([110.0, 110.0], [60.0, 50.0]);
+    let rgba: Vec<u8> = seen(shapes, &color_pose, color_size, color_focal, color_principal)
+        .flat_map(|hit| {
+            let [red, green, blue] = hit.map_or([0; 3], |(_, point)| bytes(color_srgb(&point)));
+            [red, green, blue, 255]
+        })
+        .collect();
+    Keyframe {
+        camera: "test".into(),
+        stamp: Stamp(ix),
+        size_px: color_size,
+        focal_px: color_focal,
+        principal_px: color_principal,
+        rgba_srgb: rgba.into(),
+        depth: Some(DepthMap {
+            size_px: SIZE_PX,
+            focal_px: FOCAL_PX,
+            principal_px: PRINCIPAL_PX,
+            depth_m: depth_m.into(),
+            world_from_camera,
+        }),
+        world_from_camera: color_pose,
+        twist: None,
+        readout_secs: 0.0,
+        joint_twists: [].into(),
+        split: Split::Train,
+        truth: None,
+    }
+}
+
+/// The same in the size of a depth camera's images.
+pub(super) fn large_keyframe(ix: i64, shapes: &[Shape], world_from_camera: Transform) -> Keyframe {
+    let (size_px, focal_px, principal_px) = ([640, 480], [525.0; 2], [320.0, 240.0]);
+    let mut keyframe = keyframe(ix, shapes, world_from_camera);
+    let hits: Vec<_> = seen(shapes, &world_from_camera, size_px, focal_px, principal_px).collect();
+    let colors = hits.iter().flat_map(|hit| {
+        let [red, green, blue] = hit.map_or([0; 3], |(_, point)| bytes(color_srgb(&point)));
+        [red, green, blue, 255]
+    });
+    keyframe.rgba_srgb = colors.collect::<Vec<u8>>().into();
+    (keyframe.size_px, keyframe.focal_px, keyframe.principal_px) = (size_px, focal_px, principal_px);
+    keyframe.world_from_camera = world_from_camera;
+    let depth_m: Vec<f32> = hits.iter().map(|hit| hit.map_or(0.0, |(depth, _)| f32_of(depth))).collect();
+    keyframe.depth = Some(DepthMap { size_px, focal_px, principal_px, depth_m: depth_m.into(), world_from_camera });
+    keyframe
+}
+
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "colors lie between 0 and 1")]
+fn bytes(color: [f64; 3]) -> [u8; 3] {
+    color.map(|part| (255.0 * part).round() as u8)
+}
+
+/// Depth and place of what each pixel sees.
+fn seen(
+    shapes: &[Shape],
+    world_from_camera: &Transform,
+    [width, height]: [u32; 2],
+    focal: [f64; 2],
+    principal: [f64; 2],
+) -> impl Iterator<Item = Option<(f64, Point3<f64>)>> {
+    let origin: Point3<f64> = world_from_camera.translation.vector.into();
+    let pixels = (0..height).flat_map(move |y| (0..width).map(move |x| [f64::from(x) + 0.5, f64::from(y) + 0.5]));
+    pixels.map(move |place| {
+        let in_camera = Vector3::new((place[0] - principal[0]) / focal[0], (place[1] - principal[1]) / focal[1], 1.0);
+        let along = world_from_camera.rotation * in_camera;
+        let first = shapes.iter().filter_map(|shape| shape.depth_m(&origin, &along)).min_by(f64::total_cmp)?;
+        Some((first, origin + along * first))
+    })
+}
+
+/// A ball of 30 cm whose middle is `at`.
+pub(super) fn ball(at: Point3<f64>) -> Shape {
+    Shape::Sphere { center_m: at, radius_m: 0.3 }
+}
+
+/// The floor under it.
+pub(super) fn floor() -> Shape {
+    Shape::Plane { normal: Vector3::z(), offset_m: -0.3 }
+}
+
+/// Views of a point from all around, `n` of them, evenly over the sphere (Vogel 1979).
+pub(super) fn all_around(shapes: &[Shape], target: Point3<f64>, n: usize) -> Vec<Arc<Keyframe>> {
+    (0..n)
+        .map(|ix| {
+            let height = 1.0 - (2 * ix + 1) as f64 / n as f64;
+            let (turn, radius) = (ix as f64 * 2.399_963, (1.0 - height * height).sqrt());
+            let eye = target + 1.0 * Vector3::new(radius * turn.cos(), radius * turn.sin(), height);
+            Arc::new(keyframe(i64::try_from(ix).unwrap(), shapes, looking(eye, target)))
+        })
+        .collect()
+}
+
+/// Views from a part of a ring above the floor.
+pub(super) fn ring(shapes: &[Shape], target: Point3<f64>, n: usize) -> Vec<Arc<Keyframe>> {
+    (0..n)
+        .map(|ix| {
+            let turn = 0.35 * ix as f64;
+            let eye = target + Vector3::new(1.1 * turn.cos(), 1.1 * turn.sin(), 0.5);
+            Arc::new(keyframe(i64::try_from(ix).unwrap(), shapes, looking(eye, target)))
+        })
+        .collect()
+}
+
+pub(super) fn options() -> TsdfOptions {
+    TsdfOptions { voxel_m: Some(0.02), noise_per_m2: Some(1e-4), ..TsdfOptions::default() }
+}
+
+pub(super) fn request(world_from_camera: Transform) -> RenderRequest {
+    RenderRequest {
+        world_from_camera,
+        size_px: SIZE_PX,
+        projection: Projection::Pinhole { focal_px: FOCAL_PX, principal_px: PRINCIPAL_PX },
+        shutter: None,
+        near_m: 0.01,
+        far_m: 100.0,
+        crop: None,
+        background_srgb: [0.0, 0.5, 1.0],
+    }
+}

@@ -1,0 +1,415 @@
+//! The model as a whole: what it draws, carves, keeps and gives up.
+#![expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "shares of small counts")]
+
+use super::scenes::{self, SIZE_PX, Shape};
+use super::{TsdfModel, TsdfOptions};
+use crate::checkpoint::Checkpoint;
+use crate::gpu::{Gpu, GpuOptions};
+use crate::{Aabb, Error, Keyframe, Method, Picture, Projection, RenderRequest};
+use kinematics::{Stamp, Transform};
+use nalgebra::{Point3, Vector3};
+use std::sync::Arc;
+
+fn gpu() -> Arc<Gpu> {
+    Gpu::open(&GpuOptions::default()).unwrap()
+}
+
+fn started(options: TsdfOptions, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
+    let mut model = TsdfModel::new(gpu(), options).unwrap();
+    for keyframe in keyframes {
+        model.push(keyframe.clone()).unwrap();
+    }
+    model
+}
+
+fn fused(options: TsdfOptions, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
+    let mut model = started(options, keyframes);
+    model.seed().unwrap();
+    model
+}
+
+const AT: Point3<f64> = Point3::new(0.3, -0.2, 0.1);
+
+fn ball_on_floor(n: usize) -> Vec<Arc<Keyframe>> {
+    scenes::ring(&[scenes::ball(AT), scenes::floor()], AT, n)
+}
+
+fn same(one: &Picture, other: &Picture) -> bool {
+    let bits = |picture: &Picture| picture.depth_m.iter().map(|depth| depth.to_bits()).collect::<Vec<_>>();
+    one.rgba_srgb == other.rgba_srgb && bits(one) == bits(other)
+}
+
+fn view_of(keyframe: &Keyframe) -> Transform {
+    keyframe.depth.as_ref().unwrap().world_from_camera
+}
+
+#[test]
+fn a_drawn_view_is_what_the_camera_saw() {
+    let keyframes = ball_on_floor(6);
+    let mut model = fused(scenes::options(), &keyframes);
+    let depth = keyframes[2].depth.as_ref().unwrap();
+    let picture = model.render(&scenes::request(view_of(&keyframes[2]))).unwrap();
+    let errors: Vec<f64> = picture
+        .depth_m
+        .iter()
+        .zip(depth.depth_m.iter())
+        .filter(|(got, seen)| **got > 0.0 && **seen > 0.0 && **seen < 2.0)
+        .map(|(got, seen)| f64::from(got - seen).abs())
+        .collect();
+    assert!(errors.len() > 4000, "{}", errors.len());
+    let mut sorted = errors;
+    sorted.sort_by(f64::total_cmp);
+    let of = |share: f64| sorted[(share * sorted.len() as f64) as usize];
+    // At the rim of the ball a pixel may fall to the other side.
+    assert!(of(0.5) < 0.0005 && of(0.95) < 0.002 && of(0.98) < 0.02, "{} {} {}", of(0.5), of(0.95), of(0.98));
+    assert!(picture.rgba_srgb.chunks_exact(4).zip(&picture.depth_m).all(|(rgba, z)| (rgba[3] == 255) == (*z > 0.0)));
+}
+
+#[test]
+fn what_moved_away_is_carved() {
+    let mut keyframes = ball_on_floor(4);
+    let mut without = scenes::ring(&[scenes::floor()], AT, 4);
+    for (ix, keyframe) in without.iter_mut().enumerate() {
+        Arc::make_mut(keyframe).stamp = Stamp(100 + i64::try_from(ix).unwrap());
+    }
+    let near_ball = |model: &mut TsdfModel| {
+        let mesh = model.mesh().unwrap();
+        let origin = Vector3::from(mesh.origin_m);
+        let places = mesh.positions_m.iter().map(|place| Point3::from(Vector3::from(place.map(f64::from)) + origin));
+        places.filter(|place| (place - AT).norm() < 0.33 && place.z > -0.2).count()
+    };
+    let mut model = fused(scenes::options(), &keyframes);
+    let n_before = near_ball(&mut model);
+    keyframes.extend(without);
+    let mut model = fused(scenes::options(), &keyframes);
+    let n_after = near_ball(&mut model);
+    assert!(n_before > 500 && n_after * 50 < n_before, "{n_after} of {n_before} vertices of the ball are left");
+    // The floor is still there.
+    let picture = model.render(&scenes::request(view_of(&keyframes[0]))).unwrap();
+    assert!(picture.depth_m.iter().filter(|depth| **depth > 0.0).count() > 5000);
+}
+
+#[test]
+fn without_depth_there_is_nothing_and_nothing_breaks() {
+    let mut model = TsdfModel::new(gpu(), TsdfOptions::default()).unwrap();
+    let request = scenes::request(Transform::identity());
+    let check = |model: &mut TsdfModel| {
+        let picture = model.render(&request).unwrap();
+        assert!(picture.depth_m.iter().all(|depth| *depth == 0.0));
+        assert!(picture.rgba_srgb.chunks_exact(4).all(|rgba| *rgba == [0, 128, 255, 0]));
+        assert!(model.mesh().unwrap().triangles.is_empty());
+        assert_eq!(model.step(5).unwrap(), 0);
+        assert!(model.profile_step().unwrap().is_empty());
+    };
+    check(&mut model);
+    let mut bare = (*ball_on_floor(1)[0]).clone();
+    bare.depth = None;
+    model.push(Arc::new(bare)).unwrap();
+    check(&mut model);
+    let folder = tempfile::tempdir().unwrap();
+    model.save(folder.path()).unwrap();
+    check(&mut TsdfModel::load(gpu(), folder.path()).unwrap());
+}
+
+#[test]
+fn a_camera_inside_a_wall_sees_what_lies_before_it() {
+    let keyframes = ball_on_floor(4);
+    let mut model = fused(scenes::options(), &keyframes);
+    // Just under the floor's surface, looking up and along: the floor's back is not drawn.
+    let eye = Point3::new(AT.x, AT.y - 0.5, -0.33);
+    let picture = model.render(&scenes::request(scenes::looking(eye, eye + Vector3::new(0.0, 0.3, 1.0)))).unwrap();
+    let nearest = picture.depth_m.iter().copied().filter(|depth| *depth > 0.0).fold(f32::INFINITY, f32::min);
+    assert!(nearest > 0.05, "{nearest}");
+    // Looking down from inside there is nothing at all.
+    let down = scenes::looking(eye, eye - Vector3::new(0.0, 0.3, 1.0));
+    assert!(model.render(&scenes::request(down)).unwrap().depth_m.iter().all(|depth| *depth == 0.0));
+}
+
+#[test]
+fn a_wide_scene_far_from_the_origin_is_as_exact_as_a_near_one() {
+    let origin = Vector3::new(4.1e5, -2.3e5, 80.0);
+    let mut keyframes = Vec::new();
+    let mut balls = Vec::new();
+    for ix in 0..5 {
+        let at = Point3::from(origin + Vector3::new(25.0 * f64::from(ix), 0.0, 0.0));
+        balls.push(at);
+        for mut keyframe in scenes::ring(&[scenes::ball(at)], at, 2) {
+            Arc::make_mut(&mut keyframe).stamp = Stamp(i64::try_from(keyframes.len()).unwrap());
+            keyframes.push(keyframe);
+        }
+    }
+    let mut model = fused(scenes::options(), &keyframes);
+    assert_eq!(model.n_outside(), 0);
+    let mesh = model.mesh().unwrap();
+    let far = Vector3::from(mesh.origin_m);
+    let mut n = [0; 5];
+    for place in &mesh.positions_m {
+        let place = Point3::from(Vector3::from(place.map(f64::from)) + far);
+        let (ix, at) = balls
+            .iter()
+            .enumerate()
+            .min_by(|(_, a), (_, b)| (place - **a).norm().total_cmp(&(place - **b).norm()))
+            .unwrap();
+        n[ix] += 1;
+        assert!(
+            scenes::ball(*at).distance_m(&place).abs() < 0.015,
+            "ball {ix}: {}",
+            scenes::ball(*at).distance_m(&place)
+        );
+    }
+    assert!(n.iter().all(|n| *n > 300), "{n:?}");
+    let last = keyframes.last().unwrap();
+    assert!(
+        model.render(&scenes::request(view_of(last))).unwrap().depth_m.iter().filter(|depth| **depth > 0.0).count()
+            > 1000
+    );
+}
+
+#[test]
+fn the_same_keyframes_give_the_same_bits_however_they_come() {
+    let keyframes = ball_on_floor(7);
+    let mut whole = fused(scenes::options(), &keyframes);
+    let mut again = fused(scenes::options(), &keyframes);
+    let mut one_by_one = started(scenes::options(), &keyframes);
+    while one_by_one.progress().step < 7 {
+        one_by_one.step(1).unwrap();
+    }
+    let expected = whole.blocks().unwrap();
+    assert!(again.blocks().unwrap() == expected && one_by_one.blocks().unwrap() == expected);
+    let request = scenes::request(view_of(&keyframes[3]));
+    let picture = whole.render(&request).unwrap();
+    assert!(same(&again.render(&request).unwrap(), &picture) && same(&one_by_one.render(&request).unwrap(), &picture));
+    assert!(again.mesh().unwrap() == whole.mesh().unwrap());
+}
+
+#[test]
+fn looking_fuses_no_more_than_one_keyframe() {
+    // So fine that the first frame finds no room at first.
+    let mut model = started(TsdfOptions { voxel_m: Some(0.006), ..scenes::options() }, &ball_on_floor(3));
+    model.step(2).unwrap();
+    model.render(&scenes::request(view_of(&ball_on_floor(1)[0]))).unwrap();
+    assert!((1..=2).contains(&model.progress().step), "{:?}", model.progress());
+}
+
+#[test]
+fn a_small_pool_grows_and_changes_nothing() {
+    // Voxels so fine that the pool and the table begin too small.
+    let fine = TsdfOptions { voxel_m: Some(0.006), ..scenes::options() };
+    let keyframes = ball_on_floor(3);
+    let mut grown = fused(fine.clone(), &keyframes);
+    assert!(grown.progress().primitives > 4096, "{:?}", grown.progress());
+    let mut one_by_one = started(fine, &keyframes);
+    while one_by_one.progress().step < 3 {
+        one_by_one.step(1).unwrap();
+    }
+    assert!(grown.blocks().unwrap() == one_by_one.blocks().unwrap());
+}
+
+#[test]
+fn half_the_memory_loses_nothing() {
+    // Two places, each seen twice in turn: only one of them finds room at a time.
+    let far = Point3::new(8.0, 0.0, 0.1);
+    let shapes = [scenes::ball(AT), scenes::ball(far)];
+    let options = || TsdfOptions { max_depth_m: 3.0, ..scenes::options() };
+    let mut keyframes = Vec::new();
+    for (from, at) in [(0, AT), (0, far), (2, AT), (2, far)] {
+        for keyframe in &scenes::ring(&shapes, at, 4)[from..from + 2] {
+            let mut keyframe = keyframe.clone();
+            Arc::make_mut(&mut keyframe).stamp = Stamp(i64::try_from(keyframes.len()).unwrap());
+            keyframes.push(keyframe);
+        }
+    }
+    let mut plenty = fused(options(), &keyframes);
+    let n_all = plenty.progress().primitives;
+    let max_bytes = Some(super::buffers::BYTES_PER_BLOCK * n_all * 6 / 10);
+    let mut scarce = fused(TsdfOptions { max_bytes, ..options() }, &keyframes);
+    assert_eq!(scarce.n_refused(), 0);
+    assert!(scarce.n_waiting() > 0);
+    assert!(scarce.blocks().unwrap() == plenty.blocks().unwrap());
+    for keyframe in [&keyframes[0], &keyframes[2], &keyframes[5]] {
+        let request = RenderRequest { far_m: 3.0, ..scenes::request(view_of(keyframe)) };
+        assert!(same(&scarce.render(&request).unwrap(), &plenty.render(&request).unwrap()));
+    }
+    assert!(scarce.mesh().unwrap() == plenty.mesh().unwrap());
+    // Less than one image needs: it is left out, and said so.
+    let mut tiny = fused(TsdfOptions { max_bytes: Some(20_000), ..options() }, &keyframes);
+    assert_eq!((tiny.n_refused(), tiny.progress().step), (8, 8));
+    assert!(tiny.render(&scenes::request(view_of(&keyframes[0]))).is_ok());
+}
+
+#[test]
+fn a_saved_model_draws_the_same_bits() {
+    let keyframes = ball_on_floor(4);
+    let mut model = fused(scenes::options(), &keyframes);
+    let folder = tempfile::tempdir().unwrap();
+    assert!(!TsdfModel::is_saved_in(folder.path()));
+    model.save(folder.path()).unwrap();
+    assert!(TsdfModel::is_saved_in(folder.path()));
+    for name in ["mesh.ply", "mesh.glb", "model.json"] {
+        assert!(std::fs::metadata(folder.path().join(name)).unwrap().len() > 100, "{name}");
+    }
+    let mut loaded = TsdfModel::load(gpu(), folder.path()).unwrap();
+    let mut requests = vec![scenes::request(view_of(&keyframes[1]))];
+    requests.push(RenderRequest { projection: Projection::Equirectangular, size_px: [64, 32], ..requests[0].clone() });
+    for request in requests {
+        assert!(same(&loaded.render(&request).unwrap(), &model.render(&request).unwrap()));
+    }
+    assert!(loaded.mesh().unwrap() == model.mesh().unwrap());
+    std::fs::write(folder.path().join("field.blocks"), b"nonsense").unwrap();
+    assert!(matches!(TsdfModel::load(gpu(), folder.path()), Err(Error::Checkpoint { .. })));
+}
+
+fn taken(model: &mut TsdfModel) -> Checkpoint {
+    model.checkpoint().unwrap().finish().unwrap()
+}
+
+#[test]
+fn stopping_and_going_on_changes_no_bit() {
+    let keyframes = ball_on_floor(6);
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("training.ckpt");
+    let mut whole = fused(scenes::options(), &keyframes);
+    let mut parts = started(scenes::options(), &keyframes[..5]);
+    for stop in [0, 2, 5] {
+        while parts.progress().step < stop {
+            let left = stop - parts.progress().step;
+            parts.step(left).unwrap();
+        }
+        let before = taken(&mut parts);
+        before.write(&path).unwrap();
+        let rest;
+        (parts, rest) = TsdfModel::resume(gpu(), &Checkpoint::read(&path).unwrap(), &keyframes).unwrap();
+        assert_eq!(rest.len(), 1);
+        assert_eq!(rest[0].stamp, keyframes[5].stamp);
+        assert!(taken(&mut parts) == before);
+    }
+    parts.push(keyframes[5].clone()).unwrap();
+    parts.seed().unwrap();
+    assert!(taken(&mut parts) == taken(&mut whole));
+    assert!(parts.mesh().unwrap() == whole.mesh().unwrap());
+    let refused = |checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>]| {
+        TsdfModel::resume(gpu(), checkpoint, keyframes).map(drop).unwrap_err().to_string()
+    };
+    let checkpoint = taken(&mut parts);
+    assert!(refused(&checkpoint, &keyframes[1..]).contains("image 0 of camera \"test\" is not there"));
+    let broken = |change: &dyn Fn(&mut Checkpoint)| {
+        let mut other = checkpoint.clone();
+        change(&mut other);
+        refused(&other, &keyframes)
+    };
+    assert!(broken(&|other| other.method = "splat".into()).contains("\"splat\""));
+    assert!(broken(&|other| other.state["n_blocks"] = 1.into()).contains("\"places\" has"));
+    assert!(broken(&|other| other.state["lattice"]["voxel_m"] = (-1.0).into()).contains("no field"));
+    assert!(broken(&|other| other.state["future"] = 1.into()).contains("unknown field"));
+}
+
+#[test]
+fn crops_and_ranges_cut_the_picture() {
+    let keyframes = ball_on_floor(4);
+    let mut model = fused(scenes::options(), &keyframes);
+    let mut request = scenes::request(view_of(&keyframes[0]));
+    let whole = model.render(&request).unwrap();
+    let corner: Vector3<f64> = Vector3::repeat(0.31);
+    request.crop = Some(Aabb {
+        world_from_box: Transform::translation(AT.x, AT.y, AT.z + 0.1),
+        min_m: (-corner).into(),
+        max_m: corner.into(),
+    });
+    let cropped = model.render(&request).unwrap();
+    let (mut n, mut n_off) = (0, 0);
+    for (ix, depth) in cropped.depth_m.iter().enumerate().filter(|(_, depth)| **depth > 0.0) {
+        n += 1;
+        n_off += usize::from((depth - whole.depth_m[ix]).abs() > 0.001);
+    }
+    assert!(100 * n_off < n, "{n_off} of {n}"); // At the rim.
+    let n_whole = whole.depth_m.iter().filter(|depth| **depth > 0.0).count();
+    assert!(n > 500 && 2 * n < n_whole, "{n} of {n_whole}");
+    request.crop = None;
+    request.far_m = 0.9;
+    let near = model.render(&request).unwrap();
+    assert!(near.depth_m.iter().all(|depth| *depth < 0.9));
+    request.near_m = 50.0;
+    request.far_m = 100.0;
+    assert!(model.render(&request).unwrap().depth_m.iter().all(|depth| *depth == 0.0));
+}
+
+#[test]
+fn what_was_not_fused_can_be_removed_and_bad_arrays_are_refused() {
+    let keyframes = ball_on_floor(2);
+    let mut model = started(scenes::options(), &keyframes);
+    model.remove("test", keyframes[1].stamp).unwrap();
+    model.seed().unwrap();
+    assert_eq!(model.progress().step, 1);
+    assert!(model.blocks().unwrap() == fused(scenes::options(), &keyframes[..1]).blocks().unwrap());
+    let mut short = (*keyframes[0]).clone();
+    short.depth.as_mut().unwrap().depth_m = vec![1.0; 3].into();
+    assert!(matches!(model.push(Arc::new(short)), Err(Error::DepthSize { rendered: 3, .. })));
+    let mut short = (*keyframes[0]).clone();
+    short.rgba_srgb = vec![0; 3].into();
+    assert!(matches!(model.push(Arc::new(short)), Err(Error::PictureBytes { .. })));
+}
+
+#[test]
+fn voxels_follow_the_pixels_and_the_noise() {
+    let wall = Shape::Plane { normal: Vector3::z(), offset_m: 0.0 };
+    let exact = scenes::keyframe(0, &[wall], scenes::looking(Point3::new(0.0, 0.0, 2.0), Point3::origin()));
+    let depth = exact.depth.clone().unwrap();
+    let chosen = super::Lattice::choose(&TsdfOptions::default(), &depth).unwrap();
+    assert!((chosen.voxel_m - 2.0 / 89.0).abs() < 1e-3, "{chosen:?}");
+    assert!(chosen.noise_per_m2 < 1e-6);
+    let mut noisy = depth.clone();
+    let mut state = 1_u64;
+    let mut uniform = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 40) as f32 / (1u64 << 24) as f32 - 0.5
+    };
+    noisy.depth_m =
+        noisy.depth_m.iter().map(|z| z + 0.08 * (0..4).map(|_| uniform()).sum::<f32>()).collect::<Vec<_>>().into();
+    // The sum of four uniform numbers has a deviation of 1 / sqrt(3).
+    let expected = 0.08 / 3.0f64.sqrt() / 4.0;
+    let chosen = super::Lattice::choose(&TsdfOptions::default(), &noisy).unwrap();
+    assert!((chosen.noise_per_m2 / expected - 1.0).abs() < 0.1, "{chosen:?}, expected {expected}");
+    assert!(chosen.voxel_m > 0.06 && chosen.truncation_m >= 4.0 * chosen.voxel_m - 1e-9, "{chosen:?}");
+    assert_eq!(depth.depth_m.len(), (SIZE_PX[0] * SIZE_PX[1]) as usize);
+}
+
+/// What a frame of 640x480 costs: `cargo test --release -p trainer --lib frame_of_640x480 -- --ignored --nocapture`.
+#[test]
+#[ignore = "a measurement"]
+fn frame_of_640x480() {
+    let shapes = [
+        Shape::Sphere { center_m: Point3::new(0.0, 0.0, 0.3), radius_m: 0.3 },
+        Shape::Plane { normal: Vector3::z(), offset_m: 0.0 },
+        Shape::Plane { normal: Vector3::new(0.0, -1.0, 0.0), offset_m: -1.5 },
+    ];
+    let options = || TsdfOptions { voxel_m: Some(0.01), noise_per_m2: Some(1.5e-3), ..TsdfOptions::default() };
+    let gpu = gpu();
+    eprintln!("{}", gpu.describe());
+    let mut model = TsdfModel::new(gpu, options()).unwrap();
+    let frame = |ix: i64| {
+        let turn = 0.02 * ix as f64 - 1.57;
+        let eye = Point3::new(1.6 * turn.cos(), 1.6 * turn.sin(), 0.9);
+        Arc::new(scenes::large_keyframe(ix, &shapes, scenes::looking(eye, Point3::new(0.0, 0.3, 0.3))))
+    };
+    for ix in 0..8 {
+        model.push(frame(ix)).unwrap();
+    }
+    model.seed().unwrap();
+    for ix in 8..12 {
+        model.push(frame(ix)).unwrap();
+        let timings = model.profile_step().unwrap();
+        let sum: f64 = timings.iter().map(|timing| timing.millis).sum();
+        eprintln!("{:?} {sum:.2} ms", timings.iter().map(|timing| (timing.name, timing.millis)).collect::<Vec<_>>());
+    }
+    eprintln!("{:?}", model.progress());
+    let request = scenes::request(scenes::looking(Point3::new(0.1, -1.6, 0.9), Point3::new(0.0, 0.3, 0.3)));
+    let focal_px = [525.0; 2];
+    let projection = Projection::Pinhole { focal_px, principal_px: [320.0, 240.0] };
+    let request = RenderRequest { size_px: [640, 480], projection, ..request };
+    for _ in 0..6 {
+        eprintln!("picture: {:?} ms", model.profile_picture(&request).unwrap());
+    }
+    let begin = std::time::Instant::now();
+    let mesh = model.mesh().unwrap();
+    eprintln!("mesh: {} triangles, {:.1} ms of wall time", mesh.triangles.len(), begin.elapsed().as_secs_f64() * 1e3);
+}
