@@ -270,11 +270,13 @@ impl Join {
             None => Split::of(camera.n_accepted),
         };
         let keyframe = match camera.keyframe(ripe, split, listed.is_none(), self.default_depth_m) {
-            Ok(keyframe) => Arc::new(keyframe),
+            Ok(keyframe) => keyframe,
             Err(why) => return self.refuse(&name, stamp, why, events),
         };
         camera.n_accepted += 1;
         self.counts.accepted += 1;
+        let of_ranges = if camera.config.depth.is_none() { self.ranges.depth_of(&keyframe) } else { None };
+        let keyframe = Arc::new(Keyframe { depth: keyframe.depth.or(of_ranges), ..keyframe });
         self.counts.without_depth += u64::from(camera.config.depth.is_some() && keyframe.depth.is_none());
         events.push(JoinEvent::Accepted(Arc::clone(&keyframe)));
         for (camera, stamp) in self.store.push(keyframe) {

@@ -7,10 +7,17 @@ use kinematics::{HistoryError, Stamp};
 use nalgebra::Point3;
 use std::collections::VecDeque;
 use std::sync::Arc;
-use trainer::RangePoints;
+use trainer::{DepthMap, Keyframe, RangePoints};
 
 /// Turns that may wait for poses of the base; older ones go.
 const MAX_WAITING: usize = 64;
+
+/// Pixels along each side of a cell of depth: the rings of a scanner are some ten pixels apart.
+const CELL_PX: u32 = 8;
+/// Turns this near in time to an image tell its depth: from far away other things are hidden.
+const AROUND_SECS: f64 = 1.0;
+/// With fewer cells there is no depth.
+const FEWEST_CELLS: usize = 16;
 
 /// The turns that wait for poses, and the newest of those that have them.
 pub(super) struct Ranges {
@@ -35,6 +42,44 @@ impl Ranges {
 
     pub(super) fn iter(&self) -> impl Iterator<Item = &Arc<RangePoints>> {
         self.kept.iter()
+    }
+
+    /// Depth of a keyframe's view from the turns around its instant; `None` where they show too little of it.
+    ///
+    /// A cell of [`CELL_PX`] pixels a side has the nearest of its points: what lies behind shows between the rings, too.
+    pub(super) fn depth_of(&self, keyframe: &Keyframe) -> Option<DepthMap> {
+        let size_px = keyframe.size_px.map(|side| side.div_ceil(CELL_PX));
+        let per_cell = f64::from(CELL_PX);
+        let camera_from_world = keyframe.world_from_camera.inverse();
+        let [focal_px, principal_px] = [keyframe.focal_px, keyframe.principal_px].map(|of| of.map(|px| px / per_cell));
+        let mut depth_m = vec![f32::INFINITY; (size_px[0] * size_px[1]) as usize];
+        let near_in_time = |scan: &&Arc<RangePoints>| keyframe.stamp.secs_since(scan.stamp).abs() <= AROUND_SECS;
+        for point in self.kept.iter().filter(near_in_time).flat_map(|scan| scan.points_in_world_m.iter()) {
+            let point = camera_from_world * Point3::from(*point).cast::<f64>();
+            let cell = [0, 1].map(|axis| focal_px[axis] * point[axis] / point.z + principal_px[axis]);
+            if point.z > 0.0 && (0..2).all(|axis| cell[axis] >= 0.0 && cell[axis] < f64::from(size_px[axis])) {
+                #[expect(
+                    clippy::cast_possible_truncation,
+                    clippy::cast_sign_loss,
+                    reason = "inside of the map; a range needs no more digits"
+                )]
+                let (ix, z) = (cell[1] as usize * size_px[0] as usize + cell[0] as usize, point.z as f32);
+                depth_m[ix] = depth_m[ix].min(z);
+            }
+        }
+        let mut n_seen = 0;
+        for depth_m in &mut depth_m {
+            n_seen += usize::from(depth_m.is_finite());
+            *depth_m = if depth_m.is_finite() { *depth_m } else { 0.0 };
+        }
+        let world_from_camera = keyframe.world_from_camera;
+        (n_seen >= FEWEST_CELLS).then(|| DepthMap {
+            size_px,
+            focal_px,
+            principal_px,
+            depth_m: depth_m.into(),
+            world_from_camera,
+        })
     }
 
     /// Queues a turn; false where it, or an older one, is lost.
@@ -97,5 +142,70 @@ impl Ranges {
             world_from_scanner: first,
             points_in_world_m: points.into(),
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use kinematics::Transform;
+    use trainer::Split;
+
+    fn keyframe(stamp: Stamp) -> Keyframe {
+        Keyframe {
+            camera: "front".into(),
+            stamp,
+            size_px: [160, 124],
+            focal_px: [100.0, 100.0],
+            principal_px: [80.0, 62.0],
+            rgba_srgb: vec![255; 4 * 160 * 124].into(),
+            depth: None,
+            world_from_camera: Transform::translation(0.0, 0.0, 1.0),
+            twist: None,
+            readout_secs: 0.0,
+            joint_twists: [].into(),
+            split: Split::Train,
+            truth: None,
+        }
+    }
+
+    fn ranges_of(scans: Vec<(Stamp, Vec<[f32; 3]>)>) -> Ranges {
+        let kept = scans.into_iter().map(|(stamp, points)| {
+            Arc::new(RangePoints {
+                scanner: "lidar".into(),
+                stamp,
+                world_from_scanner: Transform::identity(),
+                points_in_world_m: points.into(),
+            })
+        });
+        Ranges { scanners: Vec::new(), waiting: VecDeque::new(), kept: kept.collect(), max_kept: 9 }
+    }
+
+    /// A wall 4 m before the camera, a row of points every 16 pixels.
+    fn wall() -> Vec<[f32; 3]> {
+        (0..10).flat_map(|column| [-1.0, 1.0].map(|y| [-3.0 + 0.64 * column as f32, y, 5.0])).collect()
+    }
+
+    #[test]
+    fn the_nearest_point_of_a_cell_is_its_depth() {
+        let now = Stamp(10_000_000_000);
+        let pole = [[0.1, 0.5, 3.0], [0.0, 0.0, -2.0]]; // Before the wall's point at (0.2, 1.0), and behind the camera.
+        let ranges = ranges_of(vec![(Stamp(9_500_000_000), wall()), (now, pole.to_vec())]);
+        let depth = ranges.depth_of(&keyframe(now)).expect("enough points");
+        assert_eq!(depth.size_px, [20, 16]);
+        assert_eq!((depth.focal_px, depth.principal_px), ([12.5; 2], [10.0, 7.75]));
+        let at = |column: usize, row: usize| depth.depth_m[row * 20 + column];
+        // 12.5 * 0.2 / 4 + 10 = 12.5 * 0.1 / 2 + 10 and 12.5 * 1.0 / 4 + 7.75 = 12.5 * 0.5 / 2 + 7.75: one cell.
+        assert_eq!((at(10, 10), at(10, 4)), (2.0, 4.0));
+        assert_eq!(depth.depth_m.iter().filter(|z| **z == 4.0).count(), 19);
+        assert_eq!(depth.depth_m.iter().filter(|z| **z == 0.0).count(), 300);
+    }
+
+    #[test]
+    fn turns_of_another_time_tell_nothing() {
+        let ranges = ranges_of(vec![(Stamp(0), wall())]);
+        assert!(ranges.depth_of(&keyframe(Stamp(1_000_000_000))).is_some());
+        assert!(ranges.depth_of(&keyframe(Stamp(1_000_000_001))).is_none());
+        assert!(ranges_of(vec![(Stamp(0), wall()[..15].to_vec())]).depth_of(&keyframe(Stamp(0))).is_none());
     }
 }

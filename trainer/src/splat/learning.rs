@@ -175,6 +175,48 @@ fn learns_without_depth_from_a_random_start() {
 }
 
 /// A live scan may be longer than the plan: what comes late is still given splats.
+/// Depth as a scanner has it: a band of coarse cells.
+#[test]
+fn what_a_band_of_depth_leaves_bare_is_seeded_from_it() {
+    const SHARE: u32 = 4;
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let with_band = |keyframe: Arc<Keyframe>| {
+        let full = keyframe.depth.as_ref().unwrap();
+        let size_px = full.size_px.map(|side| side / SHARE);
+        let cell = |ix: u32| {
+            let [column, row] = [ix % size_px[0], ix / size_px[0]];
+            let middle = SHARE * row * full.size_px[0] + SHARE * column;
+            if (8..12).contains(&row) { full.depth_m[middle as usize] } else { 0.0 }
+        };
+        let depth = DepthMap {
+            size_px,
+            focal_px: full.focal_px.map(|px| px / f64::from(SHARE)),
+            principal_px: full.principal_px.map(|px| px / f64::from(SHARE)),
+            depth_m: (0..size_px[0] * size_px[1]).map(cell).collect(),
+            world_from_camera: full.world_from_camera,
+        };
+        Arc::new(Keyframe { depth: Some(depth), ..keyframe.as_ref().clone() })
+    };
+    let keyframes: Vec<_> = keyframes(&gpu, true).into_iter().map(with_band).collect();
+    let mut trainer = SplatTrainer::new(gpu, options()).unwrap();
+    trainer.push(keyframes[1].clone()).unwrap();
+    trainer.step(1).unwrap();
+    let camera_from_world = keyframes[1].world_from_camera.inverse();
+    let mut n_in_rows = [0; 5]; // Of 16 pixels; the band is the third.
+    for mean in trainer.arrays().unwrap().means {
+        let point = camera_from_world * Point3::from(mean).cast::<f64>();
+        let row = FOCAL_PX * point.y / point.z + 40.0;
+        assert!((0.5..12.0).contains(&point.z), "the band is 2 to 9 m away, a seed {} m", point.z);
+        n_in_rows[(row / 16.0).clamp(0.0, 4.0) as usize] += 1;
+    }
+    assert!(n_in_rows.iter().all(|n| *n > 30), "{n_in_rows:?}");
+    for keyframe in &keyframes[2..] {
+        trainer.push(keyframe.clone()).unwrap();
+    }
+    train(&mut trainer, 150);
+    assert!(test_psnr(&mut trainer, &keyframes) > 20.0, "{}", test_psnr(&mut trainer, &keyframes));
+}
+
 #[test]
 fn a_late_keyframe_lets_the_model_grow_again() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();

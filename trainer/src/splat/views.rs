@@ -142,7 +142,9 @@ impl LevelImages {
 
 fn median_depth_m(keyframe: &Keyframe) -> Option<f64> {
     let depth = keyframe.depth.as_ref()?;
-    let mut sample: Vec<f32> = depth.depth_m.iter().copied().step_by(997).filter(|z| *z > 0.0).collect();
+    // Some of each column and row, and enough of small images.
+    let step = 997.min(depth.depth_m.len() / 64).max(1);
+    let mut sample: Vec<f32> = depth.depth_m.iter().copied().step_by(step).filter(|z| *z > 0.0).collect();
     sample.sort_by(f32::total_cmp);
     sample.get(sample.len() / 2).map(|z| f64::from(*z))
 }
