@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::fmt::{Display, Formatter};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use trainer::eval::{Lpips, PixelPair, depth_rmse_m, psnr, ssim};
+use trainer::eval::{Lpips, PixelPair, SurfaceError, depth_rmse_m, psnr, ssim, surface_error};
 use trainer::splat::PosedLens;
 use trainer::{Keyframe, Method, Picture, Projection, RenderRequest};
 
@@ -39,6 +39,12 @@ pub(crate) struct ImageScores {
     pub(crate) lpips: Option<f64>,
     /// Root mean square along z over pixels where both have depth, metres.
     pub(crate) depth_rmse_m: Option<f64>,
+    /// Mean distance of the drawn surface from the measured one along its normal, metres: accuracy.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) surface_error_m: Option<f64>,
+    /// Share of the measured surface that is drawn within 5 mm: completeness.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) surface_within_5_mm: Option<f64>,
     /// dB against the noise-free image, drawn at the true pose; in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) psnr_truth: Option<f64>,
@@ -54,6 +60,10 @@ pub(crate) struct Scores {
     pub(crate) ssim: Option<f64>,
     pub(crate) lpips: Option<f64>,
     pub(crate) depth_rmse_m: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) surface_error_m: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) surface_within_5_mm: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) psnr_truth: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -80,13 +90,16 @@ impl Evaluator {
     pub(crate) fn score(&self, method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<ImageScores> {
         let drawn = draw(method, keyframe)?;
         let pair = PixelPair::new(keyframe.size_px, &drawn.rgba_srgb, &keyframe.rgba_srgb)?;
+        let depth = if self.all { depth_error(method, keyframe)? } else { DepthError::default() };
         Ok(ImageScores {
             camera: keyframe.camera.to_string(),
             stamp_nanos: keyframe.stamp.0,
             psnr: psnr(&pair)?,
             ssim: self.all.then(|| ssim(&pair)).transpose()?,
             lpips: self.lpips.as_ref().map(|lpips| lpips.distance(&pair)).transpose()?,
-            depth_rmse_m: if self.all { depth_error(method, keyframe)? } else { None },
+            depth_rmse_m: depth.rmse_m,
+            surface_error_m: depth.surface.map(|surface| surface.mean_m),
+            surface_within_5_mm: depth.surface.map(|surface| surface.near_frac),
             psnr_truth: if self.all { truth_score(method, keyframe)? } else { None },
             psnr_ceiling: keyframe.truth.as_ref().and_then(|truth| truth.psnr_ceiling),
         })
@@ -123,6 +136,8 @@ impl Scores {
             ssim: mean(images.iter().map(|image| image.ssim)),
             lpips: mean(images.iter().map(|image| image.lpips)),
             depth_rmse_m: mean(images.iter().map(|image| image.depth_rmse_m)),
+            surface_error_m: mean(images.iter().map(|image| image.surface_error_m)),
+            surface_within_5_mm: mean(images.iter().map(|image| image.surface_within_5_mm)),
             psnr_truth: mean(images.iter().map(|image| image.psnr_truth)),
             psnr_ceiling: mean(images.iter().map(|image| image.psnr_ceiling)),
             psnr_per_camera: psnr_per_camera
@@ -143,6 +158,8 @@ impl Display for Scores {
         words.extend(self.ssim.map(|ssim| format!("SSIM {ssim:.4}")));
         words.extend(self.lpips.map(|lpips| format!("LPIPS {lpips:.4}")));
         words.extend(self.depth_rmse_m.map(|depth| format!("depth {:.1} mm", depth * 1e3)));
+        words.extend(self.surface_error_m.map(|error| format!("surface {:.1} mm", error * 1e3)));
+        words.extend(self.surface_within_5_mm.map(|share| format!("{:.1} % within 5 mm", share * 1e2)));
         if words.is_empty() { f.write_str("no test image yet") } else { f.write_str(&words.join(", ")) }
     }
 }
@@ -191,11 +208,18 @@ fn request(keyframe: &Keyframe, lens: &PosedLens) -> RenderRequest {
     }
 }
 
+/// How depth that was drawn differs from depth that was measured.
+#[derive(Default)]
+struct DepthError {
+    rmse_m: Option<f64>,
+    surface: Option<SurfaceError>,
+}
+
 /// Depth has its own size, lens and pose, so it is drawn on its own.
-fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<Option<f64>> {
-    let Some(depth) = &keyframe.depth else { return Ok(None) };
+fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<DepthError> {
+    let Some(depth) = &keyframe.depth else { return Ok(DepthError::default()) };
     let lens = method.posed_lens(keyframe)?;
-    let Some(color_from_depth) = lens.color_from_depth else { return Ok(None) };
+    let Some(color_from_depth) = lens.color_from_depth else { return Ok(DepthError::default()) };
     let drawn = method.render(&RenderRequest {
         world_from_camera: lens.world_from_camera * color_from_depth,
         size_px: depth.size_px,
@@ -203,7 +227,10 @@ fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<O
         shutter: None,
         ..request(keyframe, &lens)
     })?;
-    Ok(depth_rmse_m(&drawn.depth_m, &depth.depth_m)?)
+    Ok(DepthError {
+        rmse_m: depth_rmse_m(&drawn.depth_m, &depth.depth_m)?,
+        surface: surface_error(&drawn.depth_m, &depth.depth_m, depth.size_px, depth.focal_px, depth.principal_px)?,
+    })
 }
 
 /// The noise-free image has no shear, and is seen from the true pose.
@@ -227,6 +254,8 @@ mod tests {
             ssim: None,
             lpips,
             depth_rmse_m: None,
+            surface_error_m: None,
+            surface_within_5_mm: None,
             psnr_truth: None,
             psnr_ceiling: None,
         }

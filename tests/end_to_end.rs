@@ -117,6 +117,7 @@ fn a_distance_field_is_built_live_replayed_scored_drawn_and_gone_on_with() {
     let psnr = number(done, "psnr");
     assert!(psnr >= LEAST_PSNR_OF_MESH, "test PSNR {psnr:.2} dB");
     assert!(number(done, "depth_rmse_m") < 0.05, "{done}");
+    assert!(number(done, "surface_error_m") < 0.004, "{done}");
 
     let replay = ["run", "rig.toml", "--from", "scan.mcap", "--out", "replay"];
     let replayed = events(folder, &[&replay[..], &run].concat());

@@ -5,7 +5,7 @@ mod lpips;
 mod psnr;
 mod ssim;
 
-pub use depth::depth_rmse_m;
+pub use depth::{SurfaceError, depth_rmse_m, surface_error};
 pub use lpips::Lpips;
 pub use psnr::psnr;
 pub use ssim::ssim;
