@@ -3,6 +3,7 @@
 use crate::config::{Rig, Train};
 use crate::exit::BadArgument;
 use crate::splat_file;
+use anyhow::Context;
 use std::path::Path;
 use std::sync::Arc;
 use trainer::checkpoint::Checkpoint;
@@ -75,9 +76,25 @@ pub(crate) fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Ke
     Ok(Resumed { kind: Kind::Splat, method: Box::new(model), options, rest })
 }
 
+/// The kind that the `model.json` of a folder names; `None` without such a file, or where it is of a version that named none.
+fn saved_kind(model: &Path) -> anyhow::Result<Option<Kind>> {
+    #[derive(serde::Deserialize)]
+    struct About {
+        method: Option<String>,
+    }
+    let path = model.join("model.json");
+    let bytes = match std::fs::read(&path) {
+        Ok(bytes) => bytes,
+        Err(_) => return Ok(None),
+    };
+    let about: About = serde_json::from_slice(&bytes).with_context(|| format!("{} is damaged", path.display()))?;
+    Ok(about.method.as_deref().and_then(Kind::named))
+}
+
 /// A saved model: its folder, of either kind, or a file of splats.
 pub(crate) fn load(gpu: Arc<Gpu>, model: &Path) -> anyhow::Result<Box<dyn Method>> {
-    if TsdfModel::is_saved_in(model) {
+    let kind = saved_kind(model)?;
+    if kind == Some(Kind::Tsdf) || (kind.is_none() && TsdfModel::is_saved_in(model)) {
         return Ok(Box::new(TsdfModel::load(gpu, model)?));
     }
     let splats = splat_file::read(model)?;

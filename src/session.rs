@@ -358,6 +358,9 @@ impl Session {
         {
             log::warn!("{error:#}");
         }
+        if self.method.progress().primitives == 0 {
+            log::warn!("the model is empty: nothing that was seen could be used");
+        }
         // Saved before it is scored: a second Ctrl-C during the scoring loses nothing.
         run_folder::save_model(self.method.as_mut(), out)?;
         if let Some(checkpoints) = &mut self.checkpoints {
@@ -498,8 +501,12 @@ impl Session {
         match self.tell {
             Tell::Json => print::json(&eval)?,
             Tell::Lines => print::line(format_args!(
-                "{seconds:7.2} s  step {:6}  {:8} splats  {:7.2} ms a step  {}",
-                eval.step, eval.primitives, progress.step_millis, eval.scores
+                "{seconds:7.2} s  step {:6}  {:8} {}s  {:7.2} ms a step  {}",
+                eval.step,
+                eval.primitives,
+                self.method.primitive(),
+                progress.step_millis,
+                eval.scores
             ))?,
             Tell::Bar | Tell::Nothing => {}
         }
@@ -531,7 +538,8 @@ impl Session {
         let position = if self.limits.steps.is_some() { progress.step } else { whole_secs(self.secs()) };
         self.bar.set_position(position);
         let psnr = self.psnr().map_or(String::new(), |psnr| format!(", {psnr:.2} dB"));
-        self.bar.set_message(format!("step {}, {} splats{psnr}", progress.step, progress.primitives));
+        let primitives = print::counted(progress.primitives, self.method.primitive());
+        self.bar.set_message(format!("step {}, {primitives}{psnr}", progress.step));
     }
 }
 

@@ -2,7 +2,7 @@
 
 use crate::config::USUAL_SEED;
 use crate::data::Data;
-use crate::exit::BadArgument;
+use crate::exit::{BadArgument, LackOfEvidence};
 use crate::method::{self, Kind};
 use crate::session::{Evaluators, Limits, Session, Tell};
 use crate::stop::Stop;
@@ -36,6 +36,12 @@ pub(crate) fn drive(mut session: Session, keyframes: &[Arc<Keyframe>], stop: &St
     session.start_clock(Instant::now());
     for keyframe in keyframes {
         session.push(keyframe)?;
+    }
+    if session.is_idle() && session.progress().step == 0 {
+        return Err(LackOfEvidence(
+            "no image to learn from has depth, and this scene model is made of depth".to_owned(),
+        )
+        .into());
     }
     while !stop.asked() && !session.is_over() && !session.is_idle() {
         session.step(u64::MAX)?;

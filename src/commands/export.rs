@@ -9,6 +9,7 @@ use crate::print::{self, counted};
 use crate::splat_file;
 use anyhow::{Context, ensure};
 use std::path::{Path, PathBuf};
+use trainer::tsdf::TsdfModel;
 
 /// Flags of `export`.
 #[derive(Debug, clap::Args)]
@@ -57,6 +58,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 fn cannot_export(from: &Path) -> BadArgument {
+    if TsdfModel::is_saved_in(from) {
+        let folder = from.display();
+        return BadArgument(format!(
+            "{folder}: a distance field, which has no splats; its mesh is mesh.ply and mesh.glb there"
+        ));
+    }
     BadArgument(format!("{}: neither a folder with splats.ply, nor a file of splats, nor a recording", from.display()))
 }
 

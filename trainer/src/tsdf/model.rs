@@ -376,7 +376,8 @@ impl Method for TsdfModel {
         }
         let n_in_flight = self.in_flight.as_ref().map_or(0, |in_flight| in_flight.n_frames);
         let n_left = (self.pending.len() - n_in_flight.min(self.pending.len())) as u64;
-        let n_frames = usize::try_from(n.min(n_left)).unwrap_or(usize::MAX).min(FRAMES_PER_SUBMIT);
+        let n_asked = n.saturating_sub(n_in_flight as u64); // `progress` does not know of those in flight.
+        let n_frames = usize::try_from(n_asked.min(n_left)).unwrap_or(usize::MAX).min(FRAMES_PER_SUBMIT);
         if n_frames == 0 {
             self.settle()?;
             return Ok(self.step - before);
@@ -392,7 +393,7 @@ impl Method for TsdfModel {
         if !failed {
             self.in_flight = Some(InFlight { status, n_frames, since });
         } // Else this one found the failure too and did nothing.
-        if n_frames as u64 == n || n_frames as u64 == n_left {
+        if n_frames as u64 == n_asked || n_frames as u64 == n_left {
             self.settle()?; // The caller stops here: the count must be true.
         }
         Ok(n_frames as u64)

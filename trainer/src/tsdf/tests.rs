@@ -192,6 +192,17 @@ fn looking_fuses_no_more_than_one_keyframe() {
 }
 
 #[test]
+fn no_more_keyframes_are_fused_than_were_asked_for() {
+    for n_wanted in [1, 5, 7, 9] {
+        let mut model = started(scenes::options(), &ball_on_floor(14));
+        while model.progress().step < n_wanted {
+            model.step(n_wanted - model.progress().step).unwrap();
+        }
+        assert_eq!((model.progress().step, model.n_taken().unwrap()), (n_wanted, n_wanted));
+    }
+}
+
+#[test]
 fn a_small_pool_grows_and_changes_nothing() {
     // Voxels so fine that the pool and the table begin too small.
     let fine = TsdfOptions { voxel_m: Some(0.006), ..scenes::options() };
