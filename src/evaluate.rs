@@ -98,7 +98,7 @@ impl Evaluator {
             ssim: self.all.then(|| ssim(&pair)).transpose()?,
             lpips: self.lpips.as_ref().map(|lpips| lpips.distance(&pair)).transpose()?,
             depth_rmse_m: depth.rmse_m,
-            surface_error_m: depth.surface.map(|surface| surface.mean_m),
+            surface_error_m: depth.surface.and_then(|surface| surface.mean_m),
             surface_within_5_mm: depth.surface.map(|surface| surface.near_frac),
             psnr_truth: if self.all { truth_score(method, keyframe)? } else { None },
             psnr_ceiling: keyframe.truth.as_ref().and_then(|truth| truth.psnr_ceiling),
@@ -229,7 +229,7 @@ fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<D
     })?;
     Ok(DepthError {
         rmse_m: depth_rmse_m(&drawn.depth_m, &depth.depth_m)?,
-        surface: surface_error(&drawn.depth_m, &depth.depth_m, depth.size_px, depth.focal_px, depth.principal_px)?,
+        surface: surface_error(&drawn.depth_m, depth)?,
     })
 }
 

@@ -76,25 +76,22 @@ pub(crate) fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Ke
     Ok(Resumed { kind: Kind::Splat, method: Box::new(model), options, rest })
 }
 
-/// The kind that the `model.json` of a folder names; `None` without such a file, or where it is of a version that named none.
-fn saved_kind(model: &Path) -> anyhow::Result<Option<Kind>> {
+/// The kind of model that a folder holds: what its `model.json` names, else what its files are; `None` where there is neither.
+pub(crate) fn kind_in(folder: &Path) -> anyhow::Result<Option<Kind>> {
     #[derive(serde::Deserialize)]
     struct About {
         method: Option<String>,
     }
-    let path = model.join("model.json");
-    let bytes = match std::fs::read(&path) {
-        Ok(bytes) => bytes,
-        Err(_) => return Ok(None),
-    };
+    let by_files = || if TsdfModel::is_saved_in(folder) { Some(Kind::Tsdf) } else { None };
+    let path = folder.join("model.json");
+    let Ok(bytes) = std::fs::read(&path) else { return Ok(by_files()) };
     let about: About = serde_json::from_slice(&bytes).with_context(|| format!("{} is damaged", path.display()))?;
-    Ok(about.method.as_deref().and_then(Kind::named))
+    Ok(about.method.as_deref().and_then(Kind::named).or_else(by_files))
 }
 
 /// A saved model: its folder, of either kind, or a file of splats.
 pub(crate) fn load(gpu: Arc<Gpu>, model: &Path) -> anyhow::Result<Box<dyn Method>> {
-    let kind = saved_kind(model)?;
-    if kind == Some(Kind::Tsdf) || (kind.is_none() && TsdfModel::is_saved_in(model)) {
+    if kind_in(model)? == Some(Kind::Tsdf) {
         return Ok(Box::new(TsdfModel::load(gpu, model)?));
     }
     let splats = splat_file::read(model)?;

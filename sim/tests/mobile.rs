@@ -2,38 +2,14 @@
 
 #![expect(clippy::cast_possible_truncation, reason = "pixel positions inside an image become indices")]
 
-use drivers::{BasePose, Image, PixelFormat, RangeScan, Sample, Source, TruthImage};
+mod common;
+
+use common::play;
+use drivers::Image;
 use kinematics::{Intrinsics, Transform};
 use nalgebra::{Isometry3, Point3, Vector3};
 use sim::layout::{ROOM_HALF_M, ROOM_HEIGHT_M};
 use sim::{CameraConfig, Config, Parent, ScannerConfig, Scene};
-
-#[derive(Default, PartialEq)]
-struct Run {
-    color: Vec<Image>,
-    depth: Vec<Image>,
-    truth: Vec<TruthImage>,
-    told: Vec<BasePose>,
-    true_base: Vec<BasePose>,
-    scans: Vec<RangeScan>,
-}
-
-fn play(config: &Config) -> Run {
-    let mut rig = sim::open(config).expect("the rig opens").into_lockstep();
-    let mut run = Run::default();
-    while let Some(sample) = rig.next_sample().expect("the rig plays") {
-        match sample {
-            Sample::Image(image) if image.format == PixelFormat::Rgb8 => run.color.push(image),
-            Sample::Image(image) => run.depth.push(image),
-            Sample::Truth(truth) => run.truth.push(truth),
-            Sample::Base(pose) => run.told.push(pose),
-            Sample::BaseTruth(pose) => run.true_base.push(pose),
-            Sample::Range(scan) => run.scans.push(scan),
-            Sample::Joints(_) => {}
-        }
-    }
-    run
-}
 
 /// A small camera ahead, and a scanner.
 fn mobile_base(rate_hz: f64) -> Config {

@@ -2,35 +2,20 @@
 
 #![expect(clippy::cast_possible_truncation, reason = "pixel positions inside an image become indices")]
 
-use drivers::{Image, PixelFormat, Sample, Source, TruthImage};
+mod common;
+
+use common::Run;
+use drivers::{Image, Sample, Source};
 use kinematics::chain::Chain;
 use kinematics::{Intrinsics, JointState, Stamp, Transform};
 use nalgebra::{Point3, Vector3};
 use sim::{Config, DepthConfig, RigInfo};
 use std::collections::BTreeMap;
 
-/// Everything a short run delivered.
-struct Run {
-    info: RigInfo,
-    color: Vec<Image>,
-    depth: Vec<Image>,
-    truth: Vec<TruthImage>,
-    joints: Vec<JointState>,
-}
-
 fn play(config: &Config) -> Run {
-    let mut rig = sim::open(config).expect("the rig opens").into_lockstep();
-    let info = rig.info().clone();
-    let mut run = Run { info, color: vec![], depth: vec![], truth: vec![], joints: vec![] };
-    while let Some(sample) = rig.next_sample().expect("the rig plays") {
-        match sample {
-            Sample::Image(image) if image.format == PixelFormat::Rgb8 => run.color.push(image),
-            Sample::Image(image) => run.depth.push(image),
-            Sample::Truth(truth) => run.truth.push(truth),
-            Sample::Joints(state) => run.joints.push(state),
-            Sample::Base(_) | Sample::BaseTruth(_) | Sample::Range(_) => panic!("a static arm has neither"),
-        }
-    }
+    let run = common::play(config);
+    let of_base = (run.told.len(), run.true_base.len(), run.scans.len());
+    assert_eq!(of_base, (0, 0, 0), "a static arm has neither");
     run
 }
 

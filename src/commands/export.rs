@@ -4,12 +4,12 @@ use crate::config::Override;
 use crate::exit::{self, BadArgument, Exit};
 use crate::export::{Written, write_nerfstudio};
 use crate::join::{Join, KeyframeList, Use};
+use crate::method::{self, Kind};
 use crate::open;
 use crate::print::{self, counted};
 use crate::splat_file;
 use anyhow::{Context, ensure};
 use std::path::{Path, PathBuf};
-use trainer::tsdf::TsdfModel;
 
 /// Flags of `export`.
 #[derive(Debug, clap::Args)]
@@ -43,6 +43,12 @@ enum Format {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let is_model = splat_file::is_one(&args.from);
     ensure!(args.from.exists(), BadArgument(format!("{} does not exist", args.from.display())));
+    if method::kind_in(&args.from)? == Some(Kind::Tsdf) {
+        return Err(wrong_kind(
+            "a distance field, which has no splats; its mesh is mesh.ply and mesh.glb there",
+            &args.from,
+        ));
+    }
     ensure!(is_model || args.from.is_file(), cannot_export(&args.from));
     match (args.to, is_model) {
         (Format::Ply, true) => export_splats(&args.from, splat_file::Format::Ply, &args.out),
@@ -58,12 +64,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 fn cannot_export(from: &Path) -> BadArgument {
-    if TsdfModel::is_saved_in(from) {
-        let folder = from.display();
-        return BadArgument(format!(
-            "{folder}: a distance field, which has no splats; its mesh is mesh.ply and mesh.glb there"
-        ));
-    }
     BadArgument(format!("{}: neither a folder with splats.ply, nor a file of splats, nor a recording", from.display()))
 }
 

@@ -1,6 +1,7 @@
 //! Posed images accepted for training: plain arrays, no driver types.
 
 use kinematics::{Stamp, Transform, Twist, transform};
+use nalgebra::Vector3;
 use std::sync::Arc;
 
 /// What a keyframe may be used for.
@@ -86,6 +87,14 @@ pub struct DepthMap {
     pub depth_m: Arc<[f32]>,
     /// Pose at the stamp of the depth image.
     pub world_from_camera: Transform,
+}
+
+impl DepthMap {
+    /// What lies at a depth of `z_m` behind the middle of a pixel, in the depth camera's axes, metres.
+    pub fn point(&self, x: u32, y: u32, z_m: f64) -> Vector3<f64> {
+        let ray = |pixel: u32, axis: usize| (f64::from(pixel) + 0.5 - self.principal_px[axis]) / self.focal_px[axis];
+        Vector3::new(ray(x, 0), ray(y, 1), 1.0) * z_m
+    }
 }
 
 /// The noise-free image and the true pose, from a simulator.

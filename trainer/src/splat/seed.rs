@@ -6,8 +6,8 @@
 
 use super::arrays::SplatArrays;
 use super::views::FAR_M;
+use crate::Keyframe;
 use crate::gpu::{f32_of, f32s_of};
-use crate::{DepthMap, Keyframe};
 use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 use std::collections::HashSet;
@@ -101,8 +101,7 @@ impl Seeder {
                 if around.iter().any(|near| (near - z).abs() > EDGE_FRAC * z && *near > 0.0) {
                     continue;
                 }
-                let point_in_camera = |x: u32, y: u32, z: f64| unproject(depth, x, y, z);
-                let here = point_in_camera(x, y, z);
+                let here = depth.point(x, y, z);
                 let spacing_m = f64::from(stride) * z / depth.focal_px[0];
                 let place = depth.world_from_camera * Point3::from(here);
                 if self.is_taken(&place, spacing_m) {
@@ -110,10 +109,10 @@ impl Seeder {
                 }
                 let Some(color) = color_at(keyframe, &place) else { continue };
                 let filled = |near: f64| if near > 0.0 { near } else { z };
-                let across = point_in_camera(x + stride, y, filled(around[1]))
-                    - point_in_camera(x - stride, y, filled(around[0]));
-                let down = point_in_camera(x, y + stride, filled(around[3]))
-                    - point_in_camera(x, y - stride, filled(around[2]));
+                let across =
+                    depth.point(x + stride, y, filled(around[1])) - depth.point(x - stride, y, filled(around[0]));
+                let down =
+                    depth.point(x, y + stride, filled(around[3])) - depth.point(x, y - stride, filled(around[2]));
                 let normal = across.cross(&down).try_normalize(1e-12).unwrap_or_else(Vector3::z);
                 // Seen at a slant the grid is wider apart on the surface.
                 let slant = (normal.dot(&here.normalize()).abs()).max(0.3);
@@ -338,11 +337,6 @@ fn color_at(keyframe: &Keyframe, place: &Point3<f64>) -> Option<[f64; 3]> {
     (rgba[3] > 0).then(|| [0, 1, 2].map(|channel| f64::from(rgba[channel]) / 255.0))
 }
 
-fn unproject(depth: &DepthMap, x: u32, y: u32, z: f64) -> Vector3<f64> {
-    let ray = |pixel: u32, axis: usize| (f64::from(pixel) + 0.5 - depth.principal_px[axis]) / depth.focal_px[axis];
-    Vector3::new(ray(x, 0), ray(y, 1), 1.0) * z
-}
-
 struct Seeds {
     arrays: SplatArrays,
 }
@@ -382,6 +376,7 @@ impl Random {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::DepthMap;
     use kinematics::{Stamp, Transform};
 
     const WALL_M: f64 = 2.0;
