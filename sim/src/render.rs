@@ -27,6 +27,20 @@ pub(crate) struct View {
     pub(crate) light_frac: f64,
 }
 
+impl View {
+    /// A small picture of whatever is at the origin.
+    fn any() -> Self {
+        Self {
+            size_px: [16, 16],
+            focal_px: [16.0; 2],
+            principal_px: [8.0; 2],
+            world_from_camera: Transform::identity(),
+            robot: None,
+            light_frac: 1.0,
+        }
+    }
+}
+
 /// A drawn picture, from the top left.
 #[derive(Clone, Debug)]
 pub(crate) struct Picture {
@@ -71,11 +85,7 @@ impl Renderer {
         let thread = std::thread::Builder::new()
             .name("sim-render".to_owned())
             .spawn(move || match HeadlessContext::open() {
-                Ok(context) => {
-                    // A closed channel means that the rig is gone already.
-                    let _ = ready.send(Ok(context.renderer().to_owned()));
-                    draw_all(&context, &model, near_far_m, &queue);
-                }
+                Ok(context) => draw_all(&context, &model, near_far_m, &ready, &queue),
                 Err(error) => {
                     let _ = ready.send(Err(error));
                 }
@@ -110,7 +120,13 @@ impl Drop for Renderer {
 }
 
 /// Draws until the last sender is gone. The context outlives everything that MuJoCo made in it.
-fn draw_all(_current: &HeadlessContext, model: &Arc<MjModel>, near_far_m: [f64; 2], queue: &Receiver<Job>) {
+fn draw_all(
+    current: &HeadlessContext,
+    model: &Arc<MjModel>,
+    near_far_m: [f64; 2],
+    ready: &Sender<Result<String, Error>>,
+    queue: &Receiver<Job>,
+) {
     // SAFETY: an OpenGL context is current on this thread until after `Canvas` is dropped; only this model is drawn.
     let mut context = unsafe { MjrContext::new(model) };
     context.offscreen();
@@ -120,6 +136,11 @@ fn draw_all(_current: &HeadlessContext, model: &Arc<MjModel>, near_far_m: [f64; 
         context,
         near_far_m,
     };
+    // Drivers compile their shaders for the first picture: seconds on a busy processor, which no camera shall seem to
+    // be silent for.
+    canvas.draw(&View::any());
+    // A closed channel means that the rig is gone already; `queue` is closed then as well.
+    let _ = ready.send(Ok(current.renderer().to_owned()));
     for job in queue {
         // The asker may have given up; the next one may not.
         let _ = job.reply.send(canvas.draw(&job.view));
