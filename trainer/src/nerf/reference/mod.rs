@@ -14,4 +14,6 @@ pub mod ray;
 pub mod space;
 
 #[cfg(test)]
+pub(crate) mod scene;
+#[cfg(test)]
 mod tests;
