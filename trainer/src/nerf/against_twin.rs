@@ -1,8 +1,8 @@
 //! The kernels against their twins in f64.
 
-use super::buffers::{BatchBuffers, FieldBuffers, FieldSlopes};
+use super::buffers::{BatchBuffers, FieldBuffers, FieldMoments, FieldSlopes};
 use super::kernels::{FieldPipelines, KERNELS, Widths};
-use super::params::{self, Batch, Level, RayLoss, Span};
+use super::params::{self, Batch, LearnRule, Level, RayLoss, Span};
 use super::passes::FieldPasses;
 use super::reference::field::{Field, FieldGrad};
 use super::reference::network::Network;
@@ -10,6 +10,7 @@ use super::reference::ray as reference;
 use super::reference::scene::{N_CODE, Ray, WEIGHTS, field, gradient, ray, samples};
 use crate::gpu::{Buffer, Gpu, GpuOptions, Passes, f32_of, f32s_of, reflect, resolve};
 use crate::mismatches::Mismatches;
+use crate::optim::reference::{Adam, Moments};
 
 /// More samples than one partial sum goes over.
 const N_RAYS: u32 = 90;
@@ -44,8 +45,8 @@ fn check_weights(
     sizes: &[usize],
     widths: &[u32],
     expected: &[f64],
+    abs: f64,
 ) {
-    let largest = expected.iter().fold(0.0f64, |most, v| most.max(v.abs()));
     let mut begin = 0;
     for (ix, pair) in sizes.windows(2).enumerate() {
         let (n_in, n_in_padded) = (pair[0], widths[ix] as usize);
@@ -54,10 +55,14 @@ fn check_weights(
             let (row, column) = (at / n_in_padded, at % n_in_padded);
             let is_real = row < pair[1] && column < n_in;
             let expected = if is_real { expected[begin + row * n_in + column] } else { 0.0 };
-            wrong.check(format!("{name} {ix}: {row} {column}"), got.into(), expected, 2e-5 * largest, 1e-4);
+            wrong.check(format!("{name} {ix}: {row} {column}"), got.into(), expected, abs, 1e-4);
         }
         begin += n_in * pair[1];
     }
+}
+
+fn largest_of(values: &[f64]) -> f64 {
+    values.iter().fold(0.0, |most, v| most.max(v.abs()))
 }
 
 struct Bench {
@@ -183,8 +188,18 @@ fn pictures_and_gradients_match_the_twin() {
             &twin.density.sizes,
             &widths.density,
             &expected.density,
+            2e-5 * largest_of(&expected.density),
         );
-        check_weights(&mut wrong, "color", gpu, &slopes.color, &twin.color.sizes, &widths.color, &expected.color);
+        check_weights(
+            &mut wrong,
+            "color",
+            gpu,
+            &slopes.color,
+            &twin.color.sizes,
+            &widths.color,
+            &expected.color,
+            2e-5 * largest_of(&expected.color),
+        );
         let got: Vec<i32> = gpu.read(&slopes.grid, 2 * twin.table.len()).unwrap();
         for (ix, (got, expected)) in got.iter().zip(expected.table.as_flattened()).enumerate() {
             wrong.check(format!("entry {ix}"), f64::from(*got) / f64::from(scale), *expected, 2e-5 * largest, 1e-4);
@@ -192,6 +207,77 @@ fn pictures_and_gradients_match_the_twin() {
         wrong.assert_none();
         assert_eq!(gpu.read::<u32>(&slopes.counts, 1).unwrap(), [0]);
     }
+}
+
+/// Steps of both, each from its own gradients.
+#[test]
+fn steps_of_learning_match_the_twin() {
+    const N_STEPS: u32 = 4;
+    let rays = rays();
+    let mut twin = field(7);
+    let of_grid = LearnRule {
+        rate: 0.02,
+        final_rate_frac: 0.25,
+        betas: [0.75, 0.875],
+        epsilon: 1e-4, // Small slopes, which f32 knows less well, move less.
+        pull: 0.0,
+        n_planned_steps: 4.0,
+        unused: 0.0,
+    };
+    let of_weights = LearnRule { rate: 0.01, pull: 0.5, ..of_grid };
+    let first_scale = 2f32.powi(28); // Fine enough for the first step; the others find their own.
+    let bench = bench(&GpuOptions::default(), &twin, &rays, &vec![first_scale; twin.shape.n_cells.len()]);
+    let Bench { gpu, pipelines, widths, field: buffers, batch, slopes, loss } = &bench;
+    let moments = FieldMoments::new(gpu, &twin.shape, widths).unwrap();
+    let rules = [gpu.uniform_with("rule", &of_grid), gpu.uniform_with("rule", &of_weights)];
+    let passes = FieldPasses { gpu, pipelines, field: buffers, batch };
+    let adam = Adam { beta1: 0.75, beta2: 0.875, epsilon: f64::from(of_grid.epsilon) };
+    let mut kept_table = vec![[Moments::default(); 2]; twin.table.len()];
+    let mut kept =
+        [vec![Moments::default(); twin.density.weights.len()], vec![Moments::default(); twin.color.weights.len()]];
+    for step in 0..N_STEPS {
+        let mut list = Passes::default();
+        passes.forward(&mut list);
+        passes.backward(&mut list, loss, slopes);
+        passes.learn(&mut list, [&rules[0], &rules[1]], slopes, &moments);
+        list.submit(gpu);
+
+        let gradient = expected(&twin, &rays);
+        let falling = 0.25f64.powf(f64::from(step) / 4.0);
+        for ((entry, slope), kept) in twin.table.iter_mut().zip(&gradient.table).zip(&mut kept_table) {
+            for feature in 0..2 {
+                if *slope != [0.0; 2] {
+                    adam.update(step + 1, 0.02 * falling, &mut entry[feature], slope[feature], &mut kept[feature]);
+                }
+            }
+        }
+        let networks = [(&mut twin.density, &gradient.density), (&mut twin.color, &gradient.color)];
+        for ((network, slopes), kept) in networks.into_iter().zip(&mut kept) {
+            for ((weight, slope), kept) in network.weights.iter_mut().zip(slopes).zip(kept) {
+                let pulled = 0.01 * falling * 0.5 * *weight;
+                adam.update(step + 1, 0.01 * falling, weight, *slope, kept);
+                *weight -= pulled;
+            }
+        }
+    }
+    let mut wrong = Mismatches::default();
+    let got: Vec<[f32; 2]> = gpu.read(&buffers.grid, twin.table.len()).unwrap();
+    for (ix, (got, expected)) in got.as_flattened().iter().zip(twin.table.as_flattened()).enumerate() {
+        wrong.check(format!("entry {ix}"), (*got).into(), *expected, 4e-4, 1e-4);
+    }
+    for (name, buffers, network, widths) in [
+        ("density", &buffers.density, &twin.density, &widths.density),
+        ("color", &buffers.color, &twin.color, &widths.color),
+    ] {
+        check_weights(&mut wrong, name, gpu, buffers, &network.sizes, widths, &network.weights, 4e-4);
+    }
+    wrong.assert_none();
+    assert_eq!(gpu.read::<u32>(&moments.steps, 1).unwrap(), [N_STEPS]);
+    assert!(gpu.read::<i32>(&slopes.grid, 2 * twin.table.len()).unwrap().iter().all(|sum| *sum == 0));
+    // A tenth of a level's largest slope still has 19 bits.
+    let scales: Vec<f32> = gpu.read(&slopes.scales, twin.shape.n_cells.len()).unwrap();
+    assert!(scales.iter().all(|scale| scale.log2().fract() == 0.0), "{scales:?}");
+    assert!(scales.iter().any(|scale| *scale != first_scale), "{scales:?}");
 }
 
 #[test]
@@ -222,6 +308,7 @@ fn every_kernel_parses_and_validates_and_structs_have_the_same_layout() {
                 Some("Space") => size_of::<params::Space>(),
                 Some("Level") => size_of::<Level>(),
                 Some("RayLoss") => size_of::<RayLoss>(),
+                Some("LearnRule") => size_of::<LearnRule>(),
                 _ => continue,
             };
             assert_eq!(*span as usize, in_rust, "{:?} in {}", found.name, kernel.source.name);

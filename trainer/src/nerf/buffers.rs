@@ -21,6 +21,7 @@ pub(crate) struct FieldBuffers {
     /// `[images, n_code]`.
     pub(crate) codes: Buffer,
     pub(crate) n_levels: u32,
+    pub(crate) n_entries: u32,
 }
 
 /// Slopes towards all that is learned.
@@ -30,10 +31,24 @@ pub(crate) struct FieldSlopes {
     pub(crate) grid: Buffer,
     /// A power of two a level.
     pub(crate) scales: Buffer,
-    /// How many contributions were too large for their scale.
+    /// How many contributions were too large for their scale: in this step, and in those before.
     pub(crate) counts: Buffer,
     pub(crate) density: Weights,
     pub(crate) color: Weights,
+}
+
+/// What the optimiser keeps.
+#[derive(Debug)]
+pub(crate) struct FieldMoments {
+    /// Four f32 an entry: first and second of both numbers.
+    pub(crate) grid: Buffer,
+    /// Two f32 a weight.
+    pub(crate) density: Weights,
+    pub(crate) color: Weights,
+    /// Largest sum of slopes of each level.
+    pub(crate) largest: Buffer,
+    /// Steps so far.
+    pub(crate) steps: Buffer,
 }
 
 /// Rays, their samples, and what is worked out of them.
@@ -78,6 +93,7 @@ impl FieldBuffers {
             color: weights(gpu, "nerf.color", &widths.color)?,
             codes: gpu.storage("nerf.codes", 4 * u64::from(n_images.max(1)) * u64::from(widths.n_code.max(1)))?,
             n_levels: u32::try_from(levels.len()).expect("a few levels"),
+            n_entries: shape.n_entries_in_all(),
         })
     }
 }
@@ -87,9 +103,24 @@ impl FieldSlopes {
         Ok(Self {
             grid: gpu.storage("nerf.v_grid", 8 * u64::from(shape.n_entries_in_all()))?,
             scales: gpu.storage("nerf.scales", 4 * shape.n_cells.len() as u64)?,
-            counts: gpu.storage("nerf.counts", 4)?,
+            counts: gpu.storage("nerf.counts", 8)?,
             density: weights(gpu, "nerf.v_density_weights", &widths.density)?,
             color: weights(gpu, "nerf.v_color_weights", &widths.color)?,
+        })
+    }
+}
+
+impl FieldMoments {
+    pub(crate) fn new(gpu: &Gpu, shape: &GridShape, widths: &Widths) -> Result<Self, Error> {
+        let pairs = |name: &str, widths: &[u32]| -> Result<Weights, Error> {
+            widths.windows(2).map(|pair| gpu.storage(name, 8 * u64::from(pair[0]) * u64::from(pair[1]))).collect()
+        };
+        Ok(Self {
+            grid: gpu.storage("nerf.grid_moments", 16 * u64::from(shape.n_entries_in_all()))?,
+            density: pairs("nerf.density_moments", &widths.density)?,
+            color: pairs("nerf.color_moments", &widths.color)?,
+            largest: gpu.storage("nerf.largest", 4 * shape.n_cells.len() as u64)?,
+            steps: gpu.storage("nerf.steps", 4)?,
         })
     }
 }

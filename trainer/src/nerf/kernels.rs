@@ -16,8 +16,14 @@ macro_rules! kernel {
     };
 }
 
-const SHARED: &[Source] =
-    &[shared!("ray_batch"), shared!("space"), shared!("hash_grid"), shared!("ray_loss"), shared!("sh")];
+const SHARED: &[Source] = &[
+    shared!("ray_batch"),
+    shared!("space"),
+    shared!("hash_grid"),
+    shared!("ray_loss"),
+    shared!("learn_rule"),
+    shared!("sh"),
+];
 
 /// All kernels of this folder.
 #[cfg(test)]
@@ -31,6 +37,9 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("composite"),
     kernel!("told_backward"),
     kernel!("scatter"),
+    kernel!("learn_weights"),
+    kernel!("learn_grid"),
+    kernel!("end_step"),
 ];
 
 /// Samples that one partial sum of slopes towards weights goes over.
@@ -73,6 +82,9 @@ pub(crate) struct FieldPipelines {
     pub(crate) told_backward: Pipeline,
     pub(crate) sum_chunks: Pipeline,
     pub(crate) scatter: Pipeline,
+    pub(crate) learn_weights: Pipeline,
+    pub(crate) learn_grid: Pipeline,
+    pub(crate) end_step: Pipeline,
 }
 
 impl FieldPipelines {
@@ -88,6 +100,9 @@ impl FieldPipelines {
             told_backward: Pipeline::new(gpu, kernel!("told_backward"), &code[..1])?,
             sum_chunks: Pipeline::new(gpu, kernel!("sum_chunks"), &[])?,
             scatter: Pipeline::new(gpu, kernel!("scatter"), &[])?,
+            learn_weights: Pipeline::new(gpu, kernel!("learn_weights"), &[])?,
+            learn_grid: Pipeline::new(gpu, kernel!("learn_grid"), &[])?,
+            end_step: Pipeline::new(gpu, kernel!("end_step"), &[])?,
         })
     }
 }

@@ -63,6 +63,19 @@ pub(crate) struct RayLoss {
     pub(crate) near_m: f32,
 }
 
+/// `LearnRule` of shared/learn_rule.wgsl.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct LearnRule {
+    pub(crate) rate: f32,
+    pub(crate) final_rate_frac: f32,
+    pub(crate) betas: [f32; 2],
+    pub(crate) epsilon: f32,
+    pub(crate) pull: f32,
+    pub(crate) n_planned_steps: f32,
+    pub(crate) unused: f32,
+}
+
 /// The levels of a grid as the kernels read them.
 pub(crate) fn levels(shape: &GridShape) -> Vec<Level> {
     let level = |ix: usize| {

@@ -1,6 +1,6 @@
 //! The stages of drawing and learning, as lists of passes.
 
-use super::buffers::{BatchBuffers, FieldBuffers, FieldSlopes};
+use super::buffers::{BatchBuffers, FieldBuffers, FieldMoments, FieldSlopes};
 use super::kernels::{FieldPipelines, LayerPipelines, N_CHUNK};
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 
@@ -71,7 +71,6 @@ impl FieldPasses<'_> {
         let told = [counts, v_log_density, ("v_color_inputs", &batch.v_color[0]), ("v_told", &batch.v_density[2])];
         list.dispatch(gpu, &pipelines.told_backward, groups(batch.n_samples, 256), &told);
         self.network_backward(list, &self.density(), &slopes.density);
-        list.clear(&slopes.grid);
         let n_lanes = u64::from(batch.n_samples) * u64::from(field.n_levels);
         let scattered = [
             counts,
@@ -85,6 +84,48 @@ impl FieldPasses<'_> {
             ("counts", &slopes.counts),
         ];
         list.dispatch(gpu, &pipelines.scatter, n_lanes.div_ceil(256), &scattered);
+    }
+
+    /// After [`FieldPasses::backward`]: one step of the optimiser, each with a rule of its own for the grid and for the weights. The
+    /// slopes towards the grid are zero afterwards.
+    pub(crate) fn learn(
+        &self,
+        list: &mut Passes,
+        [of_grid, of_weights]: [&Buffer; 2],
+        slopes: &FieldSlopes,
+        moments: &FieldMoments,
+    ) {
+        let Self { gpu, pipelines, field, .. } = *self;
+        let steps = ("steps", &moments.steps);
+        let networks = [
+            (&field.density, &slopes.density, &moments.density, &pipelines.density),
+            (&field.color, &slopes.color, &moments.color, &pipelines.color),
+        ];
+        for (weights, v_weights, moments, layers) in networks {
+            for (ix, layer) in layers.iter().enumerate() {
+                let buffers = [
+                    ("rule", of_weights),
+                    steps,
+                    ("v_weights", &v_weights[ix]),
+                    ("weights", &weights[ix]),
+                    ("moments", &moments[ix]),
+                ];
+                list.dispatch(gpu, &pipelines.learn_weights, groups(layer.n_in * layer.n_out, 64), &buffers);
+            }
+        }
+        let (scales, largest) = (("scales", &slopes.scales), ("largest", &moments.largest));
+        let learned = [
+            ("rule", of_grid),
+            steps,
+            scales,
+            largest,
+            ("levels", &field.levels),
+            ("grid", &field.grid),
+            ("moments", &moments.grid),
+            ("v_grid", &slopes.grid),
+        ];
+        list.dispatch(gpu, &pipelines.learn_grid, groups(field.n_entries, 256), &learned);
+        list.dispatch(gpu, &pipelines.end_step, 1, &[steps, scales, largest, ("counts", &slopes.counts)]);
     }
 
     fn density(&self) -> Network<'_> {
