@@ -10,6 +10,7 @@ pub mod loss;
 pub mod method;
 #[cfg(test)]
 mod mismatches;
+pub mod nerf;
 pub mod optim;
 pub mod ply;
 mod range_points;

@@ -1,0 +1,317 @@
+//! The kernels against their twins in f64.
+
+use super::buffers::{BatchBuffers, FieldBuffers, FieldMoments, FieldSlopes};
+use super::kernels::{FieldPipelines, KERNELS, Widths};
+use super::params::{self, Batch, LearnRule, Level, RayLoss, Span};
+use super::passes::FieldPasses;
+use super::reference::field::{Field, FieldGrad};
+use super::reference::network::Network;
+use super::reference::ray as reference;
+use super::reference::scene::{N_CODE, Ray, WEIGHTS, field, gradient, ray, samples};
+use crate::gpu::{Buffer, Gpu, GpuOptions, Passes, f32_of, f32s_of, reflect, resolve};
+use crate::mismatches::Mismatches;
+use crate::optim::reference::{Adam, Moments};
+
+/// More samples than one partial sum goes over.
+const N_RAYS: u32 = 90;
+
+/// Rows of a matrix with zeros around it.
+fn padded(weights: &[f64], [n_in, n_out]: [usize; 2], [n_in_padded, n_out_padded]: [u32; 2]) -> Vec<f32> {
+    let mut padded = vec![0.0; (n_in_padded * n_out_padded) as usize];
+    for row in 0..n_out {
+        for column in 0..n_in {
+            padded[row * n_in_padded as usize + column] = f32_of(weights[row * n_in + column]);
+        }
+    }
+    padded
+}
+
+fn fill(gpu: &Gpu, buffers: &[Buffer], network: &Network, widths: &[u32]) {
+    let mut begin = 0;
+    for (ix, pair) in network.sizes.windows(2).enumerate() {
+        let end = begin + pair[0] * pair[1];
+        let layer = padded(&network.weights[begin..end], [pair[0], pair[1]], [widths[ix], widths[ix + 1]]);
+        gpu.write(&buffers[ix], 0, bytemuck::cast_slice(&layer));
+        begin = end;
+    }
+}
+
+/// Compares slopes towards weights, and that those of the padding are zero.
+fn check_weights(
+    wrong: &mut Mismatches,
+    name: &str,
+    gpu: &Gpu,
+    buffers: &[Buffer],
+    sizes: &[usize],
+    widths: &[u32],
+    expected: &[f64],
+    abs: f64,
+) {
+    let mut begin = 0;
+    for (ix, pair) in sizes.windows(2).enumerate() {
+        let (n_in, n_in_padded) = (pair[0], widths[ix] as usize);
+        let got: Vec<f32> = gpu.read(&buffers[ix], n_in_padded * widths[ix + 1] as usize).unwrap();
+        for (at, got) in got.into_iter().enumerate() {
+            let (row, column) = (at / n_in_padded, at % n_in_padded);
+            let is_real = row < pair[1] && column < n_in;
+            let expected = if is_real { expected[begin + row * n_in + column] } else { 0.0 };
+            wrong.check(format!("{name} {ix}: {row} {column}"), got.into(), expected, abs, 1e-4);
+        }
+        begin += n_in * pair[1];
+    }
+}
+
+fn largest_of(values: &[f64]) -> f64 {
+    values.iter().fold(0.0, |most, v| most.max(v.abs()))
+}
+
+struct Bench {
+    gpu: std::sync::Arc<Gpu>,
+    pipelines: FieldPipelines,
+    widths: Widths,
+    field: FieldBuffers,
+    batch: BatchBuffers,
+    slopes: FieldSlopes,
+    loss: Buffer,
+}
+
+fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Bench {
+    let gpu = Gpu::open(options).unwrap();
+    let widths = Widths::new(u32::try_from(twin.shape.n_cells.len()).unwrap(), 7, u32::try_from(N_CODE).unwrap());
+    let n_samples = u32::try_from(rays.iter().map(|ray| ray.spans_m.len()).sum::<usize>()).unwrap();
+    let n_rays = u32::try_from(rays.len()).unwrap();
+    let space = params::Space { center_m: f32s_of(twin.space.center_m), radius_m: f32_of(twin.space.radius_m) };
+    let field = FieldBuffers::new(&gpu, &twin.shape, &widths, n_rays, &space).unwrap();
+    let entries: Vec<[f32; 2]> = twin.table.iter().map(|entry| f32s_of(*entry)).collect();
+    gpu.write(&field.grid, 0, bytemuck::cast_slice(&entries));
+    fill(&gpu, &field.density, &twin.density, &widths.density);
+    fill(&gpu, &field.color, &twin.color, &widths.color);
+    // Room for more than there are.
+    let batch = BatchBuffers::new(&gpu, &widths, n_rays + 3, n_samples + 600).unwrap();
+    gpu.write(&batch.batch, 0, bytemuck::bytes_of(&Batch { n_rays, n_samples }));
+    let (mut gpu_rays, mut spans, mut codes) = (Vec::new(), Vec::new(), Vec::new());
+    for (ray, code) in rays.iter().zip(0..) {
+        let byte = |value: f64| u32::from(format!("{:.0}", 255.0 * value).parse::<u8>().unwrap());
+        let [red, green, blue] = ray.target.rgb.map(byte);
+        gpu_rays.push(params::Ray {
+            origin_m: f32s_of(ray.origin_m),
+            first_sample: u32::try_from(spans.len()).unwrap(),
+            direction: f32s_of(ray.direction),
+            n_samples: u32::try_from(ray.spans_m.len()).unwrap(),
+            code,
+            target_rgb: red | green << 8 | blue << 16 | 0xff00_0000,
+            target_m: f32_of(ray.target.distance_m),
+            unused: 0,
+        });
+        let span =
+            |[begin, end]: &[f64; 2]| Span { begin_m: f32_of(*begin), end_m: f32_of(*end), ray: code, unused: 0 };
+        spans.extend(ray.spans_m.iter().map(span));
+        codes.extend(ray.code.iter().map(|value| f32_of(*value)));
+    }
+    gpu.write(&batch.rays, 0, bytemuck::cast_slice(&gpu_rays));
+    gpu.write(&batch.spans, 0, bytemuck::cast_slice(&spans));
+    gpu.write(&field.codes, 0, bytemuck::cast_slice(&codes));
+    let slopes = FieldSlopes::new(&gpu, &twin.shape, &widths).unwrap();
+    gpu.write(&slopes.scales, 0, bytemuck::cast_slice(scales));
+    let loss = gpu.uniform_with(
+        "loss",
+        &RayLoss {
+            background_srgb: [0, 1, 2, 0].map(|channel| f32_of(WEIGHTS.background_rgb[channel])),
+            distance_per_m: f32_of(WEIGHTS.distance_per_m),
+            distance_clip_m: f32_of(WEIGHTS.distance_clip_m),
+            distortion: f32_of(WEIGHTS.distortion),
+            near_m: f32_of(WEIGHTS.near_m),
+        },
+    );
+    Bench { pipelines: FieldPipelines::new(&gpu, &widths).unwrap(), gpu, widths, field, batch, slopes, loss }
+}
+
+/// With what the adapter has, and with nothing but what all have.
+fn forms() -> [GpuOptions; 2] {
+    [GpuOptions::default(), GpuOptions { optional_features: false, ..GpuOptions::default() }]
+}
+
+fn rays() -> Vec<Ray> {
+    (0..u64::from(N_RAYS)).map(|seed| ray(seed + 50)).collect()
+}
+
+/// Mean gradient over the rays.
+fn expected(twin: &Field, rays: &[Ray]) -> FieldGrad {
+    let mut sum = FieldGrad::zeros(twin);
+    let add = |sum: &mut f64, v: f64| *sum += v / f64::from(N_RAYS);
+    for ray in rays {
+        let (gradient, ..) = gradient(twin, ray);
+        sum.table.as_flattened_mut().iter_mut().zip(gradient.table.as_flattened()).for_each(|(sum, v)| add(sum, *v));
+        sum.density.iter_mut().zip(gradient.density).for_each(|(sum, v)| add(sum, v));
+        sum.color.iter_mut().zip(gradient.color).for_each(|(sum, v)| add(sum, v));
+    }
+    sum
+}
+
+#[test]
+fn pictures_and_gradients_match_the_twin() {
+    let (twin, rays) = (field(7), rays());
+    let expected = expected(&twin, &rays);
+    let largest = expected.table.as_flattened().iter().fold(0.0f64, |most, v| most.max(v.abs()));
+    let scale = f32_of((2f64.powi(28) / largest).log2().floor().exp2());
+    for options in forms() {
+        let bench = bench(&options, &twin, &rays, &vec![scale; twin.shape.n_cells.len()]);
+        let Bench { gpu, pipelines, widths, field, batch, slopes, loss } = &bench;
+        let passes = FieldPasses { gpu, pipelines, field, batch };
+        let mut list = Passes::default();
+        passes.forward(&mut list);
+        passes.backward(&mut list, loss, slopes);
+        list.submit(gpu);
+
+        let mut wrong = Mismatches::default();
+        let seen: Vec<[f32; 4]> = gpu.read(&batch.seen, rays.len()).unwrap();
+        let errors: Vec<[f32; 2]> = gpu.read(&batch.ray_errors, rays.len()).unwrap();
+        for (ix, ray) in rays.iter().enumerate() {
+            let picture = reference::composite(&samples(&twin, ray));
+            for channel in 0..3 {
+                wrong.check(
+                    format!("color {ix} {channel}"),
+                    seen[ix][channel].into(),
+                    picture.rgb[channel],
+                    1e-5,
+                    1e-5,
+                );
+            }
+            wrong.check(format!("transmittance {ix}"), seen[ix][3].into(), picture.transmittance, 1e-5, 1e-5);
+            wrong.check(format!("distance {ix}"), errors[ix][1].into(), picture.distance_m, 1e-5, 1e-5);
+        }
+        check_weights(
+            &mut wrong,
+            "density",
+            gpu,
+            &slopes.density,
+            &twin.density.sizes,
+            &widths.density,
+            &expected.density,
+            2e-5 * largest_of(&expected.density),
+        );
+        check_weights(
+            &mut wrong,
+            "color",
+            gpu,
+            &slopes.color,
+            &twin.color.sizes,
+            &widths.color,
+            &expected.color,
+            2e-5 * largest_of(&expected.color),
+        );
+        let got: Vec<i32> = gpu.read(&slopes.grid, 2 * twin.table.len()).unwrap();
+        for (ix, (got, expected)) in got.iter().zip(expected.table.as_flattened()).enumerate() {
+            wrong.check(format!("entry {ix}"), f64::from(*got) / f64::from(scale), *expected, 2e-5 * largest, 1e-4);
+        }
+        wrong.assert_none();
+        assert_eq!(gpu.read::<u32>(&slopes.counts, 1).unwrap(), [0]);
+    }
+}
+
+/// Steps of both, each from its own gradients.
+#[test]
+fn steps_of_learning_match_the_twin() {
+    const N_STEPS: u32 = 4;
+    let rays = rays();
+    let mut twin = field(7);
+    let of_grid = LearnRule {
+        rate: 0.02,
+        final_rate_frac: 0.25,
+        betas: [0.75, 0.875],
+        epsilon: 1e-4, // Small slopes, which f32 knows less well, move less.
+        pull: 0.0,
+        n_planned_steps: 4.0,
+        unused: 0.0,
+    };
+    let of_weights = LearnRule { rate: 0.01, pull: 0.5, ..of_grid };
+    let first_scale = 2f32.powi(28); // Fine enough for the first step; the others find their own.
+    let bench = bench(&GpuOptions::default(), &twin, &rays, &vec![first_scale; twin.shape.n_cells.len()]);
+    let Bench { gpu, pipelines, widths, field: buffers, batch, slopes, loss } = &bench;
+    let moments = FieldMoments::new(gpu, &twin.shape, widths).unwrap();
+    let rules = [gpu.uniform_with("rule", &of_grid), gpu.uniform_with("rule", &of_weights)];
+    let passes = FieldPasses { gpu, pipelines, field: buffers, batch };
+    let adam = Adam { beta1: 0.75, beta2: 0.875, epsilon: f64::from(of_grid.epsilon) };
+    let mut kept_table = vec![[Moments::default(); 2]; twin.table.len()];
+    let mut kept =
+        [vec![Moments::default(); twin.density.weights.len()], vec![Moments::default(); twin.color.weights.len()]];
+    for step in 0..N_STEPS {
+        let mut list = Passes::default();
+        passes.forward(&mut list);
+        passes.backward(&mut list, loss, slopes);
+        passes.learn(&mut list, [&rules[0], &rules[1]], slopes, &moments);
+        list.submit(gpu);
+
+        let gradient = expected(&twin, &rays);
+        let falling = 0.25f64.powf(f64::from(step) / 4.0);
+        for ((entry, slope), kept) in twin.table.iter_mut().zip(&gradient.table).zip(&mut kept_table) {
+            for feature in 0..2 {
+                if *slope != [0.0; 2] {
+                    adam.update(step + 1, 0.02 * falling, &mut entry[feature], slope[feature], &mut kept[feature]);
+                }
+            }
+        }
+        let networks = [(&mut twin.density, &gradient.density), (&mut twin.color, &gradient.color)];
+        for ((network, slopes), kept) in networks.into_iter().zip(&mut kept) {
+            for ((weight, slope), kept) in network.weights.iter_mut().zip(slopes).zip(kept) {
+                let pulled = 0.01 * falling * 0.5 * *weight;
+                adam.update(step + 1, 0.01 * falling, weight, *slope, kept);
+                *weight -= pulled;
+            }
+        }
+    }
+    let mut wrong = Mismatches::default();
+    let got: Vec<[f32; 2]> = gpu.read(&buffers.grid, twin.table.len()).unwrap();
+    for (ix, (got, expected)) in got.as_flattened().iter().zip(twin.table.as_flattened()).enumerate() {
+        wrong.check(format!("entry {ix}"), (*got).into(), *expected, 4e-4, 1e-4);
+    }
+    for (name, buffers, network, widths) in [
+        ("density", &buffers.density, &twin.density, &widths.density),
+        ("color", &buffers.color, &twin.color, &widths.color),
+    ] {
+        check_weights(&mut wrong, name, gpu, buffers, &network.sizes, widths, &network.weights, 4e-4);
+    }
+    wrong.assert_none();
+    assert_eq!(gpu.read::<u32>(&moments.steps, 1).unwrap(), [N_STEPS]);
+    assert!(gpu.read::<i32>(&slopes.grid, 2 * twin.table.len()).unwrap().iter().all(|sum| *sum == 0));
+    // A tenth of a level's largest slope still has 19 bits.
+    let scales: Vec<f32> = gpu.read(&slopes.scales, twin.shape.n_cells.len()).unwrap();
+    assert!(scales.iter().all(|scale| scale.log2().fract() == 0.0), "{scales:?}");
+    assert!(scales.iter().any(|scale| *scale != first_scale), "{scales:?}");
+}
+
+#[test]
+fn slopes_too_large_for_their_scale_are_counted_and_left_out() {
+    let (twin, rays) = (field(7), rays());
+    let bench = bench(&GpuOptions::default(), &twin, &rays, &vec![f32::MAX; twin.shape.n_cells.len()]);
+    let Bench { gpu, pipelines, field, batch, slopes, loss, .. } = &bench;
+    let mut list = Passes::default();
+    let passes = FieldPasses { gpu, pipelines, field, batch };
+    passes.forward(&mut list);
+    passes.backward(&mut list, loss, slopes);
+    list.submit(gpu);
+    let n_lost = gpu.read::<u32>(&slopes.counts, 1).unwrap()[0];
+    assert!(n_lost > N_RAYS * 7 * 8, "only {n_lost}");
+    assert!(gpu.read::<i32>(&slopes.grid, 2 * twin.table.len()).unwrap().iter().all(|sum| *sum == 0));
+}
+
+#[test]
+fn every_kernel_parses_and_validates_and_structs_have_the_same_layout() {
+    for kernel in KERNELS {
+        let module = reflect(kernel.source.name, &resolve(kernel.source, kernel.shared).unwrap()).unwrap();
+        for (_, found) in module.types.iter() {
+            let wgpu::naga::TypeInner::Struct { span, .. } = &found.inner else { continue };
+            let in_rust = match found.name.as_deref() {
+                Some("Batch") => size_of::<Batch>(),
+                Some("Ray") => size_of::<params::Ray>(),
+                Some("Span") => size_of::<Span>(),
+                Some("Space") => size_of::<params::Space>(),
+                Some("Level") => size_of::<Level>(),
+                Some("RayLoss") => size_of::<RayLoss>(),
+                Some("LearnRule") => size_of::<LearnRule>(),
+                _ => continue,
+            };
+            assert_eq!(*span as usize, in_rust, "{:?} in {}", found.name, kernel.source.name);
+        }
+    }
+}

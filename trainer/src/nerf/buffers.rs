@@ -1,0 +1,156 @@
+//! What the field and its samples take on the GPU.
+
+use super::kernels::{N_CHUNK, Widths};
+use super::params::{Batch, Level, Space, levels};
+use super::reference::grid::GridShape;
+use crate::Error;
+use crate::gpu::{Buffer, Gpu};
+
+/// Weights of a network, layer by layer, `[outputs, inputs]` each; or slopes towards them.
+pub(crate) type Weights = Vec<Buffer>;
+
+/// All that is learned.
+#[derive(Debug)]
+pub(crate) struct FieldBuffers {
+    pub(crate) space: Buffer,
+    pub(crate) levels: Buffer,
+    /// Two f32 an entry.
+    pub(crate) grid: Buffer,
+    pub(crate) density: Weights,
+    pub(crate) color: Weights,
+    /// `[images, n_code]`.
+    pub(crate) codes: Buffer,
+    pub(crate) n_levels: u32,
+    pub(crate) n_entries: u32,
+}
+
+/// Slopes towards all that is learned.
+#[derive(Debug)]
+pub(crate) struct FieldSlopes {
+    /// Two i32 an entry, times the scale of its level.
+    pub(crate) grid: Buffer,
+    /// A power of two a level.
+    pub(crate) scales: Buffer,
+    /// How many contributions were too large for their scale: in this step, and in those before.
+    pub(crate) counts: Buffer,
+    pub(crate) density: Weights,
+    pub(crate) color: Weights,
+}
+
+/// What the optimiser keeps.
+#[derive(Debug)]
+pub(crate) struct FieldMoments {
+    /// Four f32 an entry: first and second of both numbers.
+    pub(crate) grid: Buffer,
+    /// Two f32 a weight.
+    pub(crate) density: Weights,
+    pub(crate) color: Weights,
+    /// Largest sum of slopes of each level.
+    pub(crate) largest: Buffer,
+    /// Steps so far.
+    pub(crate) steps: Buffer,
+}
+
+/// Rays, their samples, and what is worked out of them.
+#[derive(Debug)]
+pub(crate) struct BatchBuffers {
+    pub(crate) n_rays: u32,
+    pub(crate) n_samples: u32,
+    pub(crate) batch: Buffer,
+    pub(crate) rays: Buffer,
+    pub(crate) spans: Buffer,
+    /// What the density's network is given, and what each of its layers holds.
+    pub(crate) density: Vec<Buffer>,
+    pub(crate) color: Vec<Buffer>,
+    pub(crate) v_density: Vec<Buffer>,
+    pub(crate) v_color: Vec<Buffer>,
+    pub(crate) v_log_density: Buffer,
+    pub(crate) seen: Buffer,
+    pub(crate) ray_errors: Buffer,
+    pub(crate) partial_density: Vec<Buffer>,
+    pub(crate) partial_color: Vec<Buffer>,
+}
+
+fn weights(gpu: &Gpu, name: &str, widths: &[u32]) -> Result<Weights, Error> {
+    widths.windows(2).map(|pair| gpu.storage(name, 4 * u64::from(pair[0]) * u64::from(pair[1]))).collect()
+}
+
+impl FieldBuffers {
+    /// A field of zeros.
+    pub(crate) fn new(
+        gpu: &Gpu,
+        shape: &GridShape,
+        widths: &Widths,
+        n_images: u32,
+        space: &Space,
+    ) -> Result<Self, Error> {
+        let levels: Vec<Level> = levels(shape);
+        Ok(Self {
+            space: gpu.uniform_with("nerf.space", space),
+            levels: gpu.storage_with("nerf.levels", bytemuck::cast_slice(&levels))?,
+            grid: gpu.storage("nerf.grid", 8 * u64::from(shape.n_entries_in_all()))?,
+            density: weights(gpu, "nerf.density", &widths.density)?,
+            color: weights(gpu, "nerf.color", &widths.color)?,
+            codes: gpu.storage("nerf.codes", 4 * u64::from(n_images.max(1)) * u64::from(widths.n_code.max(1)))?,
+            n_levels: u32::try_from(levels.len()).expect("a few levels"),
+            n_entries: shape.n_entries_in_all(),
+        })
+    }
+}
+
+impl FieldSlopes {
+    pub(crate) fn new(gpu: &Gpu, shape: &GridShape, widths: &Widths) -> Result<Self, Error> {
+        Ok(Self {
+            grid: gpu.storage("nerf.v_grid", 8 * u64::from(shape.n_entries_in_all()))?,
+            scales: gpu.storage("nerf.scales", 4 * shape.n_cells.len() as u64)?,
+            counts: gpu.storage("nerf.counts", 8)?,
+            density: weights(gpu, "nerf.v_density_weights", &widths.density)?,
+            color: weights(gpu, "nerf.v_color_weights", &widths.color)?,
+        })
+    }
+}
+
+impl FieldMoments {
+    pub(crate) fn new(gpu: &Gpu, shape: &GridShape, widths: &Widths) -> Result<Self, Error> {
+        let pairs = |name: &str, widths: &[u32]| -> Result<Weights, Error> {
+            widths.windows(2).map(|pair| gpu.storage(name, 8 * u64::from(pair[0]) * u64::from(pair[1]))).collect()
+        };
+        Ok(Self {
+            grid: gpu.storage("nerf.grid_moments", 16 * u64::from(shape.n_entries_in_all()))?,
+            density: pairs("nerf.density_moments", &widths.density)?,
+            color: pairs("nerf.color_moments", &widths.color)?,
+            largest: gpu.storage("nerf.largest", 4 * shape.n_cells.len() as u64)?,
+            steps: gpu.storage("nerf.steps", 4)?,
+        })
+    }
+}
+
+impl BatchBuffers {
+    /// Room for so many rays and samples.
+    pub(crate) fn new(gpu: &Gpu, widths: &Widths, n_rays: u32, n_samples: u32) -> Result<Self, Error> {
+        let floats = |name: &str, n_rows: u32, width: u32| gpu.storage(name, 4 * u64::from(n_rows) * u64::from(width));
+        let layers = |name: &str, widths: &[u32]| -> Result<Vec<Buffer>, Error> {
+            widths.iter().map(|width| floats(name, n_samples, *width)).collect()
+        };
+        let n_chunks = n_samples.div_ceil(N_CHUNK);
+        let partial_sums = |widths: &[u32]| -> Result<Vec<Buffer>, Error> {
+            widths.windows(2).map(|pair| floats("nerf.partial_sums", n_chunks, pair[0] * pair[1])).collect()
+        };
+        Ok(Self {
+            n_rays,
+            n_samples,
+            batch: gpu.storage_with("nerf.batch", bytemuck::bytes_of(&Batch { n_rays: 0, n_samples: 0 }))?,
+            rays: floats("nerf.rays", n_rays, 12)?,
+            spans: floats("nerf.spans", n_samples, 4)?,
+            density: layers("nerf.density_layers", &widths.density)?,
+            color: layers("nerf.color_layers", &widths.color)?,
+            v_density: layers("nerf.v_density_layers", &widths.density)?,
+            v_color: layers("nerf.v_color_layers", &widths.color)?,
+            v_log_density: floats("nerf.v_log_density", n_samples, 1)?,
+            seen: floats("nerf.seen", n_rays, 4)?,
+            ray_errors: floats("nerf.ray_errors", n_rays, 2)?,
+            partial_density: partial_sums(&widths.density)?,
+            partial_color: partial_sums(&widths.color)?,
+        })
+    }
+}

@@ -1,0 +1,35 @@
+// end_step: counts the step, and scales the next slopes of each level so that sums keep 8 bits of room.
+//
+// threads   one per level
+// reads     largest [n_levels] of this step's sums, counts ([0]: contributions that were too large)
+// writes    scales [n_levels], largest (zero again), counts ([0] zero again, [1]: too large so far), steps
+//
+// Every level's slopes are scaled by a power of two of its own, from what its largest sum was.
+
+
+@group(0) @binding(0) var<storage, read_write> scales: array<f32>;
+@group(0) @binding(1) var<storage, read_write> largest: array<u32>;
+@group(0) @binding(2) var<storage, read_write> counts: array<u32>;
+@group(0) @binding(3) var<storage, read_write> steps: array<u32>;
+
+const WANTED_BITS = 23u;   // of the largest sum, of 31
+const MOST_SCALE = 1.0e30;
+
+@compute @workgroup_size(64)
+fn main(@builtin(local_invocation_index) lane: u32) {
+    let n_lost = counts[0];
+    if lane < arrayLength(&scales) {
+        let n_bits = 32u - countLeadingZeros(largest[lane]);
+        // A level without slopes keeps its scale; what was lost was too large by an unknown factor.
+        var change = select(exp2(f32(WANTED_BITS) - f32(n_bits)), 1.0, n_bits == 0u);
+        if n_lost > 0u { change = min(change, 1.0) / 16.0; }
+        scales[lane] = clamp(scales[lane] * change, 1.0 / MOST_SCALE, MOST_SCALE);
+        largest[lane] = 0u;
+    }
+    storageBarrier(); // All have read how many were lost.
+    if lane == 0u {
+        counts[1] += n_lost;
+        counts[0] = 0u;
+        steps[0] += 1u;
+    }
+}

@@ -1,0 +1,87 @@
+//! Small structs the kernels read, with the layouts of their WGSL twins.
+
+use super::reference::grid::GridShape;
+
+/// `Batch` of shared/ray_batch.wgsl.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct Batch {
+    pub(crate) n_rays: u32,
+    pub(crate) n_samples: u32,
+}
+
+/// `Ray` of shared/ray_batch.wgsl.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct Ray {
+    pub(crate) origin_m: [f32; 3],
+    pub(crate) first_sample: u32,
+    pub(crate) direction: [f32; 3],
+    pub(crate) n_samples: u32,
+    pub(crate) code: u32,
+    pub(crate) target_rgb: u32,
+    pub(crate) target_m: f32,
+    pub(crate) unused: u32,
+}
+
+/// `Span` of shared/ray_batch.wgsl.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct Span {
+    pub(crate) begin_m: f32,
+    pub(crate) end_m: f32,
+    pub(crate) ray: u32,
+    pub(crate) unused: u32,
+}
+
+/// `Space` of shared/space.wgsl.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct Space {
+    pub(crate) center_m: [f32; 3],
+    pub(crate) radius_m: f32,
+}
+
+/// `Level` of shared/hash_grid.wgsl.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct Level {
+    pub(crate) n_cells: u32,
+    pub(crate) begin: u32,
+    pub(crate) mask: u32,
+    pub(crate) unused: u32,
+}
+
+/// `RayLoss` of shared/ray_loss.wgsl.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct RayLoss {
+    pub(crate) background_srgb: [f32; 4],
+    pub(crate) distance_per_m: f32,
+    pub(crate) distance_clip_m: f32,
+    pub(crate) distortion: f32,
+    pub(crate) near_m: f32,
+}
+
+/// `LearnRule` of shared/learn_rule.wgsl.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct LearnRule {
+    pub(crate) rate: f32,
+    pub(crate) final_rate_frac: f32,
+    pub(crate) betas: [f32; 2],
+    pub(crate) epsilon: f32,
+    pub(crate) pull: f32,
+    pub(crate) n_planned_steps: f32,
+    pub(crate) unused: f32,
+}
+
+/// The levels of a grid as the kernels read them.
+pub(crate) fn levels(shape: &GridShape) -> Vec<Level> {
+    let level = |ix: usize| {
+        let is_dense = (u64::from(shape.n_cells[ix]) + 1).pow(3) <= 1 << shape.log2_entries;
+        let mask = if is_dense { 0 } else { (1 << shape.log2_entries) - 1 };
+        Level { n_cells: shape.n_cells[ix], begin: shape.begin(ix), mask, unused: 0 }
+    };
+    (0..shape.n_cells.len()).map(level).collect()
+}

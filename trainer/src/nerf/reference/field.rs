@@ -1,0 +1,108 @@
+//! Density and color of a point that is looked at along a direction.
+
+use super::grid::{self, GridShape, N_FEATURES};
+use super::network::Network;
+use super::space::Space;
+
+/// Numbers that the first network hands on to the second, after the density.
+pub const N_HANDED_ON: usize = 15;
+/// Basis functions of the direction: spherical harmonics up to degree 3.
+pub const N_DIRECTION: usize = 16;
+/// The logarithm of the density ends here, so that no density is infinite.
+pub const MOST_LOG_DENSITY: f64 = 12.0;
+
+/// All parameters of a field.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Field {
+    /// Where the scene lies.
+    pub space: Space,
+    /// Sizes of the grid.
+    pub shape: GridShape,
+    /// Entries of the grid.
+    pub table: Vec<[f64; N_FEATURES]>,
+    /// From what the grid holds to the logarithm of the density and what is handed on.
+    pub density: Network,
+    /// From direction, what is handed on, and the code of the image, to color before the sigmoid.
+    pub color: Network,
+}
+
+/// Gradient of a loss by the parameters of a field.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FieldGrad {
+    /// By the entries of the grid.
+    pub table: Vec<[f64; N_FEATURES]>,
+    /// By the weights of the first network.
+    pub density: Vec<f64>,
+    /// By the weights of the second.
+    pub color: Vec<f64>,
+}
+
+impl FieldGrad {
+    /// Zeros in the shape of a field.
+    pub fn zeros(field: &Field) -> Self {
+        Self {
+            table: vec![[0.0; N_FEATURES]; field.table.len()],
+            density: vec![0.0; field.density.weights.len()],
+            color: vec![0.0; field.color.weights.len()],
+        }
+    }
+}
+
+/// What a point is like, and what it was computed from.
+#[derive(Clone, Debug)]
+pub struct Point {
+    /// Per metre.
+    pub density: f64,
+    /// 0 to 1.
+    pub rgb: [f64; 3],
+    contracted: [f64; 3],
+    density_layers: Vec<Vec<f64>>,
+    color_layers: Vec<Vec<f64>>,
+}
+
+impl Field {
+    /// Sizes of the two networks, with hidden layers of a width: one in the first, two in the second.
+    pub fn sizes(shape: &GridShape, width: usize, n_code: usize) -> [Vec<usize>; 2] {
+        [vec![shape.n_outputs(), width, 1 + N_HANDED_ON], vec![N_DIRECTION + N_HANDED_ON + n_code, width, width, 3]]
+    }
+
+    /// Density and color of a point in world, metres, looked at along a direction of length 1, in an image with a code.
+    pub fn point(&self, world_m: [f64; 3], direction: [f64; 3], code: &[f64]) -> Point {
+        let contracted = self.space.contract(world_m);
+        let density_layers = self.density.forward(&grid::look_up(&self.shape, &self.table, contracted));
+        let out = density_layers.last().expect("an output layer");
+        let density = out[0].min(MOST_LOG_DENSITY).exp();
+        let input = [&harmonics(direction)[..], &out[1..], code].concat();
+        let color_layers = self.color.forward(&input);
+        let out = color_layers.last().expect("an output layer");
+        let rgb = std::array::from_fn(|channel| 1.0 / (1.0 + (-out[channel]).exp()));
+        Point { density, rgb, contracted, density_layers, color_layers }
+    }
+
+    /// Carries slopes towards density and color back to the parameters, where they add up; those towards the point in world and
+    /// towards the image's code come back.
+    pub fn point_backward(
+        &self,
+        world_m: [f64; 3],
+        point: &Point,
+        v_density: f64,
+        v_rgb: [f64; 3],
+        gradient: &mut FieldGrad,
+    ) -> ([f64; 3], Vec<f64>) {
+        let v_out: Vec<f64> = point.rgb.iter().zip(v_rgb).map(|(value, v)| v * value * (1.0 - value)).collect();
+        let v_input = self.color.backward(&point.color_layers, &v_out, &mut gradient.color);
+        let (v_handed_on, v_code) = v_input[N_DIRECTION..].split_at(N_HANDED_ON);
+        let log_density = point.density_layers.last().expect("an output layer")[0];
+        let v_log = if log_density < MOST_LOG_DENSITY { v_density * point.density } else { 0.0 };
+        let v_out = [&[v_log][..], v_handed_on].concat();
+        let v_found = self.density.backward(&point.density_layers, &v_out, &mut gradient.density);
+        let v_contracted =
+            grid::look_up_backward(&self.shape, &self.table, point.contracted, &v_found, &mut gradient.table);
+        (self.space.contract_backward(world_m, v_contracted), v_code.to_vec())
+    }
+}
+
+/// Real spherical harmonics up to degree 3 of a direction of length 1, constant term first.
+pub fn harmonics(direction: [f64; 3]) -> [f64; N_DIRECTION] {
+    crate::splat::reference::sh::basis(&direction.into())
+}

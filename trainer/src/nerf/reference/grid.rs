@@ -1,0 +1,122 @@
+//! The hash grid: levels of cubic cells whose corners hold two numbers each.
+
+/// Numbers that each corner of a level holds.
+pub const N_FEATURES: usize = 2;
+
+/// Sizes of a grid.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct GridShape {
+    /// Cells along an axis, from the coarsest level to the finest.
+    pub n_cells: Vec<u32>,
+    /// Most entries of a level, as a power of two; a level with fewer corners has one entry each, others share them by a hash.
+    pub log2_entries: u32,
+}
+
+impl GridShape {
+    /// Levels between two numbers of cells, evenly over the logarithm.
+    pub fn between(coarsest: u32, finest: u32, n_levels: u32, log2_entries: u32) -> Self {
+        let growth = (f64::from(finest) / f64::from(coarsest)).ln() / f64::from(n_levels.max(2) - 1);
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "rounded between two u32")]
+        let n_cells = |level: u32| (f64::from(coarsest) * (growth * f64::from(level)).exp()).round() as u32;
+        Self { n_cells: (0..n_levels).map(n_cells).collect(), log2_entries }
+    }
+
+    /// Entries of a level.
+    pub fn n_entries(&self, level: usize) -> u32 {
+        let most = 1u64 << self.log2_entries;
+        let n_corners = (u64::from(self.n_cells[level]) + 1).pow(3);
+        u32::try_from(n_corners.min(most)).expect("at most 2^log2_entries, which is a u32")
+    }
+
+    /// First entry of a level.
+    pub fn begin(&self, level: usize) -> u32 {
+        (0..level).map(|level| self.n_entries(level)).sum()
+    }
+
+    /// Entries of all levels.
+    pub fn n_entries_in_all(&self) -> u32 {
+        self.begin(self.n_cells.len())
+    }
+
+    /// Numbers that come out of a look-up.
+    pub fn n_outputs(&self) -> usize {
+        self.n_cells.len() * N_FEATURES
+    }
+
+    /// Place of a corner among all entries; source of the hash: Mueller et al. 2022, equation 4.
+    pub fn entry(&self, level: usize, corner: [u32; 3]) -> u32 {
+        let side = self.n_cells[level] + 1;
+        let [x, y, z] = corner;
+        let is_dense = u64::from(side).pow(3) <= 1u64 << self.log2_entries;
+        let within = if is_dense {
+            x + side * (y + side * z)
+        } else {
+            (x ^ y.wrapping_mul(2_654_435_761) ^ z.wrapping_mul(805_459_861)) & ((1 << self.log2_entries) - 1)
+        };
+        self.begin(level) + within
+    }
+}
+
+/// A corner of the cell around a point.
+#[derive(Clone, Copy, Debug)]
+struct Corner {
+    entry: usize,
+    weight: f64,
+    /// Of the weight towards the point, which is in units of the cube.
+    slope: [f64; 3],
+}
+
+/// The corners of the cell of a level around a point of the unit cube; a point outside counts as the nearest one inside.
+fn corners(shape: &GridShape, level: usize, at: [f64; 3]) -> [Corner; 8] {
+    let n_cells = f64::from(shape.n_cells[level]);
+    let scaled = at.map(|x| x.clamp(0.0, 1.0) * n_cells);
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "between 0 and the number of cells")]
+    let first = scaled.map(|x| x.floor().min(n_cells - 1.0) as u32);
+    let share: [f64; 3] = std::array::from_fn(|axis| scaled[axis] - f64::from(first[axis]));
+    std::array::from_fn(|ix| {
+        let step: [u32; 3] = std::array::from_fn(|axis| u32::try_from(ix >> axis & 1).expect("0 or 1"));
+        let part = |axis: usize| if step[axis] == 1 { share[axis] } else { 1.0 - share[axis] };
+        let slope = std::array::from_fn(|axis| {
+            let sign = if step[axis] == 1 { n_cells } else { -n_cells };
+            let inside = at[axis] >= 0.0 && at[axis] <= 1.0;
+            if inside { sign * part((axis + 1) % 3) * part((axis + 2) % 3) } else { 0.0 }
+        });
+        let corner = std::array::from_fn(|axis| first[axis] + step[axis]);
+        Corner { entry: shape.entry(level, corner) as usize, weight: part(0) * part(1) * part(2), slope }
+    })
+}
+
+/// What a point of the unit cube finds: two numbers a level, between the eight corners of its cell.
+pub fn look_up(shape: &GridShape, table: &[[f64; N_FEATURES]], at: [f64; 3]) -> Vec<f64> {
+    let mut found = Vec::with_capacity(shape.n_outputs());
+    for level in 0..shape.n_cells.len() {
+        let corners = corners(shape, level, at);
+        for feature in 0..N_FEATURES {
+            found.push(corners.iter().map(|corner| corner.weight * table[corner.entry][feature]).sum());
+        }
+    }
+    found
+}
+
+/// Carries slopes towards what was found back to the table, where they add up, and to the point.
+pub fn look_up_backward(
+    shape: &GridShape,
+    table: &[[f64; N_FEATURES]],
+    at: [f64; 3],
+    upstream: &[f64],
+    v_table: &mut [[f64; N_FEATURES]],
+) -> [f64; 3] {
+    let mut v_at = [0.0; 3];
+    for level in 0..shape.n_cells.len() {
+        for corner in corners(shape, level, at) {
+            for feature in 0..N_FEATURES {
+                let v = upstream[level * N_FEATURES + feature];
+                v_table[corner.entry][feature] += corner.weight * v;
+                for axis in 0..3 {
+                    v_at[axis] += corner.slope[axis] * table[corner.entry][feature] * v;
+                }
+            }
+        }
+    }
+    v_at
+}

@@ -1,0 +1,150 @@
+//! Gradients against central differences, and the parts against what they are defined by.
+
+use super::field::Field;
+use super::grid::{self, GridShape};
+use super::ray::{self, Sample};
+use super::scene::{N_CODE, Ray, field, gradient, loss, ray};
+use super::space::Space;
+use crate::mismatches::Mismatches;
+
+const NUDGE: f64 = 1e-5;
+const ABS: f64 = 1e-9;
+const REL: f64 = 1e-5;
+fn central(at: impl Fn(f64) -> f64) -> f64 {
+    (at(NUDGE) - at(-NUDGE)) / (2.0 * NUDGE)
+}
+
+#[test]
+fn gradients_of_a_ray_match_central_differences() {
+    let mut wrong = Mismatches::default();
+    for seed in [3, 4, 5] {
+        let (field, ray) = (field(seed), ray(seed + 10));
+        let (slopes, v_origin, v_code) = gradient(&field, &ray);
+        let nudged = |change: &dyn Fn(&mut Field, f64), step: f64| {
+            let mut field = field.clone();
+            change(&mut field, step);
+            loss(&field, &ray)
+        };
+        for (ix, entry) in slopes.table.iter().enumerate() {
+            for feature in 0..2 {
+                let numeric = central(|step| nudged(&|field, step| field.table[ix][feature] += step, step));
+                wrong.check(format!("{seed}: entry {ix} {feature}"), entry[feature], numeric, ABS, REL);
+            }
+        }
+        for (ix, slope) in slopes.density.iter().enumerate() {
+            let numeric = central(|step| nudged(&|field, step| field.density.weights[ix] += step, step));
+            wrong.check(format!("{seed}: density {ix}"), *slope, numeric, ABS, REL);
+        }
+        for (ix, slope) in slopes.color.iter().enumerate() {
+            let numeric = central(|step| nudged(&|field, step| field.color.weights[ix] += step, step));
+            wrong.check(format!("{seed}: color {ix}"), *slope, numeric, ABS, REL);
+        }
+        for axis in 0..3 {
+            let moved = |step: f64| {
+                let mut origin_m = ray.origin_m;
+                origin_m[axis] += step;
+                loss(&field, &Ray { origin_m, spans_m: ray.spans_m.clone(), code: ray.code.clone(), ..ray })
+            };
+            wrong.check(format!("{seed}: origin {axis}"), v_origin[axis], central(moved), ABS, REL);
+        }
+        for ix in 0..N_CODE {
+            let moved = |step: f64| {
+                let mut code = ray.code.clone();
+                code[ix] += step;
+                loss(&field, &Ray { code, spans_m: ray.spans_m.clone(), ..ray })
+            };
+            wrong.check(format!("{seed}: code {ix}"), v_code[ix], central(moved), ABS, REL);
+        }
+    }
+    wrong.assert_none();
+}
+
+#[test]
+fn contraction_keeps_the_inside_and_draws_in_the_outside() {
+    let space = Space { center_m: [1.0, 2.0, 3.0], radius_m: 2.0 };
+    assert_eq!(space.contract([1.0, 2.0, 3.0]), [0.5; 3]);
+    assert_eq!(space.contract([3.0, 0.0, 3.0]), [0.75, 0.25, 0.5]);
+    let far = space.contract([1e9, 2.0, 3.0]);
+    assert!(far[0] > 0.999_999 && far[0] < 1.0 && (far[1] - 0.5).abs() < 1e-9, "{far:?}");
+    let mut wrong = Mismatches::default();
+    let upstream = [0.7, -0.4, 0.9];
+    for world_m in [[1.3, 1.2, 3.9], [9.0, -3.0, 4.0], [-20.0, 30.0, -50.0], [2.0, 2.5, -7.0]] {
+        let slopes = space.contract_backward(world_m, upstream);
+        for axis in 0..3 {
+            let numeric = central(|step| {
+                let mut moved = world_m;
+                moved[axis] += step;
+                space.contract(moved).iter().zip(upstream).map(|(x, v)| x * v).sum()
+            });
+            wrong.check(format!("{world_m:?} {axis}"), slopes[axis], numeric, 1e-9, 1e-6);
+        }
+    }
+    wrong.assert_none();
+}
+
+#[test]
+fn a_grid_returns_what_its_corners_hold_and_lines_between_them() {
+    let shape = GridShape { n_cells: vec![4], log2_entries: 10 };
+    // A linear function is found again everywhere.
+    let linear = |at: [f64; 3]| [0.3 + at[0] - 2.0 * at[1] + 0.5 * at[2], at[0] * 3.0 - at[2]];
+    let mut table = vec![[0.0; 2]; shape.n_entries_in_all() as usize];
+    for ix in 0..125u32 {
+        let corner = [ix % 5, ix / 5 % 5, ix / 25];
+        table[shape.entry(0, corner) as usize] = linear(corner.map(|x| f64::from(x) / 4.0));
+    }
+    for at in [[0.0; 3], [1.0; 3], [0.25, 0.5, 0.75], [0.13, 0.99, 0.47]] {
+        let (found, expected) = (grid::look_up(&shape, &table, at), linear(at));
+        assert!(
+            found.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-12),
+            "{at:?}: {found:?}"
+        );
+    }
+}
+
+#[test]
+fn levels_grow_evenly_and_large_ones_share_entries() {
+    let shape = GridShape::between(16, 2048, 16, 19);
+    assert_eq!((shape.n_cells[0], shape.n_cells[15]), (16, 2048));
+    assert!(shape.n_cells.windows(2).all(|pair| pair[1] > pair[0] && pair[1] < 2 * pair[0]));
+    assert_eq!((shape.n_entries(0), shape.n_entries(15)), (17 * 17 * 17, 1 << 19));
+    let hit: std::collections::BTreeSet<u32> =
+        (0..20_000).map(|ix| shape.entry(15, [ix % 29, ix / 29 % 31, ix / 899])).collect();
+    assert!(hit.len() > 19_000, "few share an entry while there are many more entries: {}", hit.len());
+    assert!(hit.iter().all(|entry| *entry >= shape.begin(15) && *entry < shape.n_entries_in_all()));
+}
+
+#[test]
+fn a_ray_adds_up_to_one_and_an_opaque_sample_hides_the_rest() {
+    let sample = |begin_m: f64, density: f64, red: f64| Sample {
+        span_m: [begin_m, begin_m + 0.5],
+        density,
+        rgb: [red, 0.0, 1.0],
+    };
+    let samples = [sample(1.0, 0.5, 0.2), sample(1.5, 1e3, 0.9), sample(2.0, 2.0, 0.1)];
+    let seen = ray::composite(&samples);
+    assert!((seen.weights.iter().sum::<f64>() + seen.transmittance - 1.0).abs() < 1e-12);
+    let first = 1.0 - (-0.25f64).exp();
+    assert!((seen.rgb[0] - (first * 0.2 + (1.0 - first) * 0.9)).abs() < 1e-9 && seen.weights[2] < 1e-9);
+    assert!((seen.distance_m - (first * 1.25 + (1.0 - first) * 1.75)).abs() < 1e-9);
+}
+
+/// The sum over all pairs, as it is defined.
+#[test]
+fn distortion_in_one_pass_is_the_sum_over_pairs() {
+    let samples: Vec<Sample> = [[1.0, 1.4], [1.5, 1.9], [1.9, 4.0], [6.0, 7.0]]
+        .map(|span_m| Sample { span_m, density: 1.0, rgb: [0.0; 3] })
+        .to_vec();
+    let weights = [0.1, 0.4, 0.2, 0.15];
+    let place = |t_m: f64| 1.0 - 0.5 / t_m;
+    let middle = |ix: usize| 0.5 * (place(samples[ix].span_m[0]) + place(samples[ix].span_m[1]));
+    let mut expected = 0.0;
+    for i in 0..4 {
+        for j in 0..4 {
+            expected += weights[i] * weights[j] * (middle(i) - middle(j)).abs();
+        }
+        expected += weights[i] * weights[i] * (place(samples[i].span_m[1]) - place(samples[i].span_m[0])) / 3.0;
+    }
+    assert!((ray::distortion(&samples, &weights, 0.5).0 - expected).abs() < 1e-12);
+    let alone = ray::distortion(&samples, &[0.0, 1e-9, 0.0, 0.0], 0.5);
+    assert!(alone.0 < 1e-12, "light from one short place is not spread: {}", alone.0);
+}

@@ -1,0 +1,37 @@
+// hash_grid: which entries of a level a point lies between. After `space`.
+
+struct Level {
+    n_cells: u32,
+    begin: u32,             // its first entry
+    mask: u32,              // entries less one, a power of two less one; 0: an entry a corner
+    unused: u32,
+}
+
+struct Cell {
+    first: vec3u,           // corner nearest to zero
+    share: vec3f,           // of the way to the corner opposite
+}
+
+fn cell_of(level: Level, at: vec3f) -> Cell {
+    let scaled = clamp(at, vec3f(0.0), vec3f(1.0)) * f32(level.n_cells);
+    let first = min(vec3u(scaled), vec3u(level.n_cells - 1u));
+    return Cell(first, scaled - vec3f(first));
+}
+
+// source: Mueller et al. 2022, equation 4
+fn entry_of(level: Level, corner: vec3u) -> u32 {
+    if level.mask == 0u {
+        let side = level.n_cells + 1u;
+        return level.begin + corner.x + side * (corner.y + side * corner.z);
+    }
+    return level.begin + ((corner.x ^ (corner.y * 2654435761u) ^ (corner.z * 805459861u)) & level.mask);
+}
+
+fn step_of(ix: u32) -> vec3u {
+    return vec3u(ix, ix >> 1u, ix >> 2u) & vec3u(1u);
+}
+
+fn weight_of(cell: Cell, step: vec3u) -> f32 {
+    let parts = select(1.0 - cell.share, cell.share, step == vec3u(1u));
+    return parts.x * parts.y * parts.z;
+}
