@@ -8,6 +8,7 @@ use std::path::Path;
 use std::sync::Arc;
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
+use trainer::nerf::{NerfModel, NerfOptions};
 use trainer::splat::{SplatOptions, SplatTrainer};
 use trainer::tsdf::{TsdfModel, TsdfOptions};
 use trainer::{Keyframe, Method};
@@ -19,13 +20,16 @@ pub(crate) enum Kind {
     Splat,
     /// A distance field with a mesh, from depth.
     Tsdf,
+    /// A neural field.
+    Nerf,
 }
 
 impl Kind {
     /// The kind that a rig file names.
     pub(crate) fn of_rig(rig: &Rig) -> Result<Self, BadArgument> {
         let name = &rig.train.method;
-        Self::named(name).ok_or_else(|| BadArgument(format!("train.method = {name:?}: must be \"splat\" or \"tsdf\"")))
+        Self::named(name)
+            .ok_or_else(|| BadArgument(format!("train.method = {name:?}: must be \"splat\", \"nerf\" or \"tsdf\"")))
     }
 
     /// The kind of a name.
@@ -38,17 +42,23 @@ impl Kind {
         match self {
             Self::Splat => "splat",
             Self::Tsdf => "tsdf",
+            Self::Nerf => "nerf",
         }
     }
 
-    /// A model that has seen nothing yet. Of the options a distance field has the memory it may take; what else it wants
-    /// to know it finds in the depth.
+    /// A model that has seen nothing yet. Of the options a distance field has the memory it may take, a neural field also
+    /// seed and planned steps; what else they want to know they find in the keyframes.
     pub(crate) fn start(self, gpu: Arc<Gpu>, options: SplatOptions) -> anyhow::Result<Box<dyn Method>> {
         match self {
             Self::Splat => Ok(Box::new(SplatTrainer::new(gpu, options)?)),
             Self::Tsdf => {
                 let options = TsdfOptions { max_bytes: options.max_bytes, ..TsdfOptions::default() };
                 Ok(Box::new(TsdfModel::new(gpu, options)?))
+            }
+            Self::Nerf => {
+                let SplatOptions { seed, max_bytes, n_planned_steps, .. } = options;
+                let options = NerfOptions { seed, max_bytes, n_planned_steps, ..NerfOptions::default() };
+                Ok(Box::new(NerfModel::new(gpu, options)?))
             }
         }
     }
@@ -71,6 +81,12 @@ pub(crate) fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Ke
         let options = SplatOptions { max_bytes: model.options().max_bytes, ..SplatOptions::default() };
         return Ok(Resumed { kind: Kind::Tsdf, method: Box::new(model), options, rest });
     }
+    if checkpoint.method == Kind::Nerf.name() {
+        let (model, rest) = NerfModel::resume(gpu, checkpoint, keyframes)?;
+        let NerfOptions { seed, max_bytes, n_planned_steps, .. } = *model.options();
+        let options = SplatOptions { seed, max_bytes, n_planned_steps, ..SplatOptions::default() };
+        return Ok(Resumed { kind: Kind::Nerf, method: Box::new(model), options, rest });
+    }
     let (model, rest) = SplatTrainer::resume(gpu, checkpoint, keyframes)?;
     let options = model.options().clone();
     Ok(Resumed { kind: Kind::Splat, method: Box::new(model), options, rest })
@@ -82,17 +98,20 @@ pub(crate) fn kind_in(folder: &Path) -> anyhow::Result<Option<Kind>> {
     struct About {
         method: Option<String>,
     }
-    let by_files = || if TsdfModel::is_saved_in(folder) { Some(Kind::Tsdf) } else { None };
+    let saved_here = [(TsdfModel::is_saved_in(folder), Kind::Tsdf), (NerfModel::is_saved_in(folder), Kind::Nerf)];
+    let by_files = || saved_here.into_iter().find_map(|(is_here, kind)| is_here.then_some(kind));
     let path = folder.join("model.json");
     let Ok(bytes) = std::fs::read(&path) else { return Ok(by_files()) };
     let about: About = serde_json::from_slice(&bytes).with_context(|| format!("{} is damaged", path.display()))?;
     Ok(about.method.as_deref().and_then(Kind::named).or_else(by_files))
 }
 
-/// A saved model: its folder, of either kind, or a file of splats.
+/// A saved model: its folder, of any kind, or a file of splats.
 pub(crate) fn load(gpu: Arc<Gpu>, model: &Path) -> anyhow::Result<Box<dyn Method>> {
-    if kind_in(model)? == Some(Kind::Tsdf) {
-        return Ok(Box::new(TsdfModel::load(gpu, model)?));
+    match kind_in(model)? {
+        Some(Kind::Tsdf) => return Ok(Box::new(TsdfModel::load(gpu, model)?)),
+        Some(Kind::Nerf) => return Ok(Box::new(NerfModel::load(gpu, model)?)),
+        Some(Kind::Splat) | None => {}
     }
     let splats = splat_file::read(model)?;
     let model = if model.is_dir() { Some(model) } else { None };

@@ -10,7 +10,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use trainer::{Keyframe, Method};
 
 /// The files of a saved model: what `checkpoint_sha256` covers, in this order.
-const MODEL_FILES: [&str; 5] = ["model.json", "mesh.ply", "mesh.glb", "field.blocks", "splats.ply"];
+const MODEL_FILES: [&str; 6] = ["model.json", "mesh.ply", "mesh.glb", "field.blocks", "field.nerf", "splats.ply"];
 /// Where a model lies until it is whole.
 const UNFINISHED: &str = "model.part";
 /// Held while a run writes into a folder.

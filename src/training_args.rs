@@ -10,7 +10,8 @@ use trainer::splat::{CameraChoice, CountChoice, TermSet};
 /// What to train, and how large it may become.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct TrainingArgs {
-    /// Scene model: splat, or tsdf, a distance field with a mesh [default: the rig file's, else splat]
+    /// Scene model: splat; nerf, a neural field; or tsdf, a distance field with a mesh [default: the rig
+    /// file's, else splat]
     #[arg(long, value_name = "METHOD", hide_possible_values = true)]
     pub(crate) method: Option<Kind>,
     /// Seed of everything random, 0 to 2^63 - 1; with --steps, one seed gives one result [default: the rig file's, else 1]

@@ -139,6 +139,44 @@ fn a_distance_field_is_built_live_replayed_scored_drawn_and_gone_on_with() {
     assert_eq!(whole["checkpoint_sha256"], done["checkpoint_sha256"], "two halves give another model");
 }
 
+/// Steps of a neural field: few, since software takes its time over each.
+const N_RAY_STEPS: &str = "120";
+/// Measured 16.5 dB: keyframes come in while it learns.
+const LEAST_PSNR_OF_RAYS: f64 = 14.0;
+
+#[test]
+fn a_neural_field_is_learned_live_replayed_scored_drawn_and_gone_on_with() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    rig_file(folder);
+    let common = ["--method", "nerf", "--json", "--steps", N_RAY_STEPS];
+    let run = [&["--steps-per-keyframe", "8", "--listen", "127.0.0.1:0"], &common[..]].concat();
+    let live = ["run", "rig.toml", "--sim", "--record", "scan.mcap", "--out", "live"];
+    let told = events(folder, &[&live[..], &run].concat());
+    let done = told.last().expect("events");
+    let psnr = number(done, "psnr");
+    assert!(psnr >= LEAST_PSNR_OF_RAYS, "test PSNR {psnr:.2} dB");
+    assert_eq!(done["steps"].as_u64(), N_RAY_STEPS.parse().ok());
+
+    let replay = ["run", "rig.toml", "--from", "scan.mcap", "--out", "replay"];
+    let replayed = events(folder, &[&replay[..], &run].concat());
+    assert_eq!(replayed.last().expect("events")["checkpoint_sha256"], done["checkpoint_sha256"]);
+    scores_a_saved_model_alike(folder, psnr);
+    draws_a_saved_model(folder);
+
+    let train = ["train", "scan.mcap", "--keyframes", "live/keyframes.txt", "--json"];
+    let taken = |args: &[&str]| events(folder, &[&train[..], args].concat()).last().cloned().expect("events");
+    let begin = ["--method", "nerf", "--plan-steps", "30"];
+    taken(&[&begin[..], &["--steps", "15", "--out", "half"]].concat());
+    let whole = taken(&[&begin[..], &["--steps", "30", "--out", "whole"]].concat());
+    let resumed = taken(&["--resume", "half", "--steps", "30", "--out", "resumed"]);
+    assert_eq!(resumed["checkpoint_sha256"], whole["checkpoint_sha256"], "two halves give another model");
+
+    let exported = fieldrig(folder, &["export", "live", "--to", "ply", "--out", "splats.ply"]);
+    let told = String::from_utf8_lossy(&exported.stderr);
+    assert!(!exported.status.success() && told.contains("a neural field, which has no splats"), "{told}");
+}
+
 /// What `run` said of its model, `eval` says of the saved one.
 fn scores_a_saved_model_alike(folder: &Path, psnr: f64) {
     /// The file keeps the parameters' bits; scores are sums in the same order.

@@ -43,11 +43,15 @@ enum Format {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let is_model = splat_file::is_one(&args.from);
     ensure!(args.from.exists(), BadArgument(format!("{} does not exist", args.from.display())));
-    if method::kind_in(&args.from)? == Some(Kind::Tsdf) {
-        return Err(wrong_kind(
-            "a distance field, which has no splats; its mesh is mesh.ply and mesh.glb there",
-            &args.from,
-        ));
+    match method::kind_in(&args.from)? {
+        Some(Kind::Tsdf) => {
+            return Err(wrong_kind(
+                "a distance field, which has no splats; its mesh is mesh.ply and mesh.glb there",
+                &args.from,
+            ));
+        }
+        Some(Kind::Nerf) => return Err(wrong_kind("a neural field, which has no splats", &args.from)),
+        Some(Kind::Splat) | None => {}
     }
     ensure!(is_model || args.from.is_file(), cannot_export(&args.from));
     match (args.to, is_model) {

@@ -28,7 +28,7 @@ pub(super) const SCANNER_DRIVERS: [(&str, ScannerDriver); 2] =
     [("udp", ScannerDriver::Udp), ("sim", ScannerDriver::Sim)];
 pub(super) const PARENTS: [(&str, Parent); 3] =
     [("flange", Parent::Flange), ("base", Parent::Base), ("world", Parent::World)];
-const METHODS: [(&str, &str); 2] = [("splat", "splat"), ("tsdf", "tsdf")];
+const METHODS: [(&str, &str); 3] = [("splat", "splat"), ("nerf", "nerf"), ("tsdf", "tsdf")];
 /// Poses and lens coefficients beyond this are slips of the pen.
 const FAR: f64 = 1e4;
 /// Offsets of joints beyond this, rad or m, are not offsets.

@@ -25,7 +25,7 @@ pub enum Error {
     DeviceLost,
     /// A buffer past the adapter's limit.
     #[error(
-        "buffer {label}: {bytes} bytes are more than this GPU can bind ({limit_bytes} bytes); lower --max-splats or the image size"
+        "buffer {label}: {bytes} bytes are more than this GPU can bind ({limit_bytes} bytes); lower --max-splats, --max-bytes or the image size"
     )]
     BufferTooLarge {
         /// Name of the buffer.
@@ -34,6 +34,14 @@ pub enum Error {
         bytes: u64,
         /// Bytes allowed.
         limit_bytes: u64,
+    },
+    /// Less memory than the smallest model of the method takes.
+    #[error("max_bytes = {max_bytes}: the smallest neural field takes {least_bytes} bytes")]
+    BudgetTooSmall {
+        /// Bytes allowed.
+        max_bytes: u64,
+        /// Bytes needed.
+        least_bytes: u64,
     },
     /// A kernel imports what is not there.
     #[error("kernel {kernel}: unknown import {import:?}")]

@@ -1,5 +1,6 @@
 //! Posed images accepted for training: plain arrays, no driver types.
 
+use crate::Error;
 use kinematics::{Stamp, Transform, Twist, transform};
 use nalgebra::Vector3;
 use std::sync::Arc;
@@ -58,6 +59,21 @@ pub struct Keyframe {
 }
 
 impl Keyframe {
+    /// Refuses arrays that do not have their pixels.
+    pub(crate) fn check(&self) -> Result<(), Error> {
+        let [width, height] = self.size_px;
+        let expected = 4 * width as usize * height as usize;
+        if self.rgba_srgb.len() != expected {
+            return Err(Error::PictureBytes { what: "keyframe", width, height, got: self.rgba_srgb.len(), expected });
+        }
+        let Some(depth) = &self.depth else { return Ok(()) };
+        let expected = depth.size_px[0] as usize * depth.size_px[1] as usize;
+        if depth.depth_m.len() != expected {
+            return Err(Error::DepthSize { rendered: depth.depth_m.len(), truth: expected });
+        }
+        Ok(())
+    }
+
     /// Whether all numbers about the camera are finite; readings of depth may be what they like.
     pub fn is_finite(&self) -> bool {
         let lens = |focal_px: [f64; 2], principal_px: [f64; 2]| {

@@ -15,11 +15,14 @@ pub mod optim;
 pub mod ply;
 mod range_points;
 pub mod request;
+mod seen;
 pub mod sort;
 pub mod splat;
 pub mod spz;
 #[cfg(test)]
 mod test_data;
+#[cfg(test)]
+mod test_scenes;
 
 pub mod tsdf;
 

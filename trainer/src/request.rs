@@ -67,3 +67,13 @@ pub struct Picture {
     /// `[height, width]`, metres along z (distance for equirectangular); 0 where nothing is.
     pub depth_m: Vec<f32>,
 }
+
+impl Picture {
+    /// Nothing but background.
+    pub(crate) fn empty(size_px: [u32; 2], background_srgb: [f32; 3]) -> Self {
+        let n = size_px[0] as usize * size_px[1] as usize;
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to 0 to 255")]
+        let [red, green, blue] = background_srgb.map(|part| (part.clamp(0.0, 1.0) * 255.0 + 0.5).floor() as u8);
+        Self { size_px, rgba_srgb: [red, green, blue, 0].repeat(n), depth_m: vec![0.0; n] }
+    }
+}

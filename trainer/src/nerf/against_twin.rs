@@ -1,6 +1,6 @@
 //! The kernels against their twins in f64.
 
-use super::buffers::{BatchBuffers, FieldBuffers, FieldMoments, FieldSlopes};
+use super::buffers::{BatchBuffers, FieldBuffers, FieldMoments, FieldSlopes, RaySlot};
 use super::kernels::{FieldPipelines, KERNELS, Widths};
 use super::params::{self, Batch, LearnRule, Level, RayLoss, Span};
 use super::passes::FieldPasses;
@@ -8,6 +8,7 @@ use super::reference::field::{Field, FieldGrad};
 use super::reference::network::Network;
 use super::reference::ray as reference;
 use super::reference::scene::{N_CODE, Ray, WEIGHTS, field, gradient, ray, samples};
+use super::reference::space::contract;
 use crate::gpu::{Buffer, Gpu, GpuOptions, Passes, f32_of, f32s_of, reflect, resolve};
 use crate::mismatches::Mismatches;
 use crate::optim::reference::{Adam, Moments};
@@ -39,11 +40,8 @@ fn fill(gpu: &Gpu, buffers: &[Buffer], network: &Network, widths: &[u32]) {
 /// Compares slopes towards weights, and that those of the padding are zero.
 fn check_weights(
     wrong: &mut Mismatches,
-    name: &str,
-    gpu: &Gpu,
-    buffers: &[Buffer],
-    sizes: &[usize],
-    widths: &[u32],
+    (name, gpu, buffers): (&str, &Gpu, &[Buffer]),
+    (sizes, widths): (&[usize], &[u32]),
     expected: &[f64],
     abs: f64,
 ) {
@@ -72,58 +70,74 @@ struct Bench {
     field: FieldBuffers,
     batch: BatchBuffers,
     slopes: FieldSlopes,
-    loss: Buffer,
+    slot: RaySlot,
 }
 
 fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Bench {
     let gpu = Gpu::open(options).unwrap();
     let widths = Widths::new(u32::try_from(twin.shape.n_cells.len()).unwrap(), 7, u32::try_from(N_CODE).unwrap());
-    let n_samples = u32::try_from(rays.iter().map(|ray| ray.spans_m.len()).sum::<usize>()).unwrap();
+    let n_samples = u32::try_from(rays.iter().map(|ray| ray.spans.len()).sum::<usize>()).unwrap();
     let n_rays = u32::try_from(rays.len()).unwrap();
-    let space = params::Space { center_m: f32s_of(twin.space.center_m), radius_m: f32_of(twin.space.radius_m) };
-    let field = FieldBuffers::new(&gpu, &twin.shape, &widths, n_rays, &space).unwrap();
+    let field = FieldBuffers::new(&gpu, &twin.shape, &widths, n_rays).unwrap();
     let entries: Vec<[f32; 2]> = twin.table.iter().map(|entry| f32s_of(*entry)).collect();
     gpu.write(&field.grid, 0, bytemuck::cast_slice(&entries));
     fill(&gpu, &field.density, &twin.density, &widths.density);
     fill(&gpu, &field.color, &twin.color, &widths.color);
     // Room for more than there are.
     let batch = BatchBuffers::new(&gpu, &widths, n_rays + 3, n_samples + 600).unwrap();
-    gpu.write(&batch.batch, 0, bytemuck::bytes_of(&Batch { n_rays, n_samples }));
-    let (mut gpu_rays, mut spans, mut codes) = (Vec::new(), Vec::new(), Vec::new());
+    gpu.write(&batch.batch, 0, bytemuck::bytes_of(&Batch { n_samples, ..Batch::of(n_rays) }));
+    let (mut gpu_rays, mut spans, mut points, mut codes) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for (ray, code) in rays.iter().zip(0..) {
         let byte = |value: f64| u32::from(format!("{:.0}", 255.0 * value).parse::<u8>().unwrap());
         let [red, green, blue] = ray.target.rgb.map(byte);
         gpu_rays.push(params::Ray {
-            origin_m: f32s_of(ray.origin_m),
+            origin: f32s_of(ray.origin),
             first_sample: u32::try_from(spans.len()).unwrap(),
             direction: f32s_of(ray.direction),
-            n_samples: u32::try_from(ray.spans_m.len()).unwrap(),
+            n_samples: u32::try_from(ray.spans.len()).unwrap(),
             code,
             target_rgb: red | green << 8 | blue << 16 | 0xff00_0000,
-            target_m: f32_of(ray.target.distance_m),
-            unused: 0,
+            target_distance: f32_of(ray.target.distance),
+            ..params::Ray::default()
         });
-        let span =
-            |[begin, end]: &[f64; 2]| Span { begin_m: f32_of(*begin), end_m: f32_of(*end), ray: code, unused: 0 };
-        spans.extend(ray.spans_m.iter().map(span));
+        let span = |[begin, end]: &[f64; 2]| Span { begin: f32_of(*begin), end: f32_of(*end), ray: code, unused: 0 };
+        spans.extend(ray.spans.iter().map(span));
+        let point = |[begin, end]: &[f64; 2]| {
+            let at = std::array::from_fn(|axis| ray.origin[axis] + 0.5 * (begin + end) * ray.direction[axis]);
+            let [x, y, z] = f32s_of(contract(at));
+            [x, y, z, 0.0]
+        };
+        points.extend(ray.spans.iter().flat_map(point));
         codes.extend(ray.code.iter().map(|value| f32_of(*value)));
     }
-    gpu.write(&batch.rays, 0, bytemuck::cast_slice(&gpu_rays));
+    let slot = RaySlot::new(&gpu, n_rays + 3).unwrap();
+    gpu.write(&slot.rays, 0, bytemuck::cast_slice(&gpu_rays));
+    gpu.write(&batch.points, 0, bytemuck::cast_slice(&points));
     gpu.write(&batch.spans, 0, bytemuck::cast_slice(&spans));
     gpu.write(&field.codes, 0, bytemuck::cast_slice(&codes));
     let slopes = FieldSlopes::new(&gpu, &twin.shape, &widths).unwrap();
     gpu.write(&slopes.scales, 0, bytemuck::cast_slice(scales));
-    let loss = gpu.uniform_with(
-        "loss",
-        &RayLoss {
-            background_srgb: [0, 1, 2, 0].map(|channel| f32_of(WEIGHTS.background_rgb[channel])),
-            distance_per_m: f32_of(WEIGHTS.distance_per_m),
-            distance_clip_m: f32_of(WEIGHTS.distance_clip_m),
-            distortion: f32_of(WEIGHTS.distortion),
-            near_m: f32_of(WEIGHTS.near_m),
-        },
-    );
-    Bench { pipelines: FieldPipelines::new(&gpu, &widths).unwrap(), gpu, widths, field, batch, slopes, loss }
+    let loss = RayLoss {
+        background_srgb: [0, 1, 2, 0].map(|channel| f32_of(WEIGHTS.background_rgb[channel])),
+        distance_weight: f32_of(WEIGHTS.distance_weight),
+        distance_clip: f32_of(WEIGHTS.distance_clip),
+        distortion: f32_of(WEIGHTS.distortion),
+        near: f32_of(WEIGHTS.near),
+        sight: f32_of(WEIGHTS.sight),
+        band: f32_of(WEIGHTS.band[1]),
+        band_frac: f32_of(WEIGHTS.band[0]),
+        unused: 0.0,
+    };
+    gpu.write(&slot.loss, 0, bytemuck::bytes_of(&loss));
+    Bench {
+        pipelines: FieldPipelines::new(&gpu, &widths, n_samples + 600, 0).unwrap(),
+        gpu,
+        widths,
+        field,
+        batch,
+        slopes,
+        slot,
+    }
 }
 
 /// With what the adapter has, and with nothing but what all have.
@@ -156,11 +170,11 @@ fn pictures_and_gradients_match_the_twin() {
     let scale = f32_of((2f64.powi(28) / largest).log2().floor().exp2());
     for options in forms() {
         let bench = bench(&options, &twin, &rays, &vec![scale; twin.shape.n_cells.len()]);
-        let Bench { gpu, pipelines, widths, field, batch, slopes, loss } = &bench;
-        let passes = FieldPasses { gpu, pipelines, field, batch };
+        let Bench { gpu, pipelines, widths, field, batch, slopes, slot } = &bench;
+        let passes = FieldPasses { gpu, pipelines, field, batch, slot };
         let mut list = Passes::default();
         passes.forward(&mut list);
-        passes.backward(&mut list, loss, slopes);
+        passes.backward(&mut list, slopes);
         list.submit(gpu);
 
         let mut wrong = Mismatches::default();
@@ -168,35 +182,23 @@ fn pictures_and_gradients_match_the_twin() {
         let errors: Vec<[f32; 2]> = gpu.read(&batch.ray_errors, rays.len()).unwrap();
         for (ix, ray) in rays.iter().enumerate() {
             let picture = reference::composite(&samples(&twin, ray));
-            for channel in 0..3 {
-                wrong.check(
-                    format!("color {ix} {channel}"),
-                    seen[ix][channel].into(),
-                    picture.rgb[channel],
-                    1e-5,
-                    1e-5,
-                );
+            for (channel, (got, expected)) in seen[ix].iter().zip(picture.rgb).enumerate() {
+                wrong.check(format!("color {ix} {channel}"), (*got).into(), expected, 1e-5, 1e-5);
             }
             wrong.check(format!("transmittance {ix}"), seen[ix][3].into(), picture.transmittance, 1e-5, 1e-5);
-            wrong.check(format!("distance {ix}"), errors[ix][1].into(), picture.distance_m, 1e-5, 1e-5);
+            wrong.check(format!("distance {ix}"), errors[ix][1].into(), picture.distance, 1e-5, 1e-5);
         }
         check_weights(
             &mut wrong,
-            "density",
-            gpu,
-            &slopes.density,
-            &twin.density.sizes,
-            &widths.density,
+            ("density", gpu, &slopes.density),
+            (&twin.density.sizes, &widths.density),
             &expected.density,
             2e-5 * largest_of(&expected.density),
         );
         check_weights(
             &mut wrong,
-            "color",
-            gpu,
-            &slopes.color,
-            &twin.color.sizes,
-            &widths.color,
+            ("color", gpu, &slopes.color),
+            (&twin.color.sizes, &widths.color),
             &expected.color,
             2e-5 * largest_of(&expected.color),
         );
@@ -227,10 +229,10 @@ fn steps_of_learning_match_the_twin() {
     let of_weights = LearnRule { rate: 0.01, pull: 0.5, ..of_grid };
     let first_scale = 2f32.powi(28); // Fine enough for the first step; the others find their own.
     let bench = bench(&GpuOptions::default(), &twin, &rays, &vec![first_scale; twin.shape.n_cells.len()]);
-    let Bench { gpu, pipelines, widths, field: buffers, batch, slopes, loss } = &bench;
-    let moments = FieldMoments::new(gpu, &twin.shape, widths).unwrap();
+    let Bench { gpu, pipelines, widths, field: buffers, batch, slopes, slot } = &bench;
+    let moments = FieldMoments::new(gpu, &twin.shape, widths, &of_grid).unwrap();
     let rules = [gpu.uniform_with("rule", &of_grid), gpu.uniform_with("rule", &of_weights)];
-    let passes = FieldPasses { gpu, pipelines, field: buffers, batch };
+    let passes = FieldPasses { gpu, pipelines, field: buffers, batch, slot };
     let adam = Adam { beta1: 0.75, beta2: 0.875, epsilon: f64::from(of_grid.epsilon) };
     let mut kept_table = vec![[Moments::default(); 2]; twin.table.len()];
     let mut kept =
@@ -238,7 +240,7 @@ fn steps_of_learning_match_the_twin() {
     for step in 0..N_STEPS {
         let mut list = Passes::default();
         passes.forward(&mut list);
-        passes.backward(&mut list, loss, slopes);
+        passes.backward(&mut list, slopes);
         passes.learn(&mut list, [&rules[0], &rules[1]], slopes, &moments);
         list.submit(gpu);
 
@@ -269,7 +271,7 @@ fn steps_of_learning_match_the_twin() {
         ("density", &buffers.density, &twin.density, &widths.density),
         ("color", &buffers.color, &twin.color, &widths.color),
     ] {
-        check_weights(&mut wrong, name, gpu, buffers, &network.sizes, widths, &network.weights, 4e-4);
+        check_weights(&mut wrong, (name, gpu, buffers), (&network.sizes, widths), &network.weights, 4e-4);
     }
     wrong.assert_none();
     assert_eq!(gpu.read::<u32>(&moments.steps, 1).unwrap(), [N_STEPS]);
@@ -284,11 +286,11 @@ fn steps_of_learning_match_the_twin() {
 fn slopes_too_large_for_their_scale_are_counted_and_left_out() {
     let (twin, rays) = (field(7), rays());
     let bench = bench(&GpuOptions::default(), &twin, &rays, &vec![f32::MAX; twin.shape.n_cells.len()]);
-    let Bench { gpu, pipelines, field, batch, slopes, loss, .. } = &bench;
+    let Bench { gpu, pipelines, field, batch, slopes, slot, .. } = &bench;
     let mut list = Passes::default();
-    let passes = FieldPasses { gpu, pipelines, field, batch };
+    let passes = FieldPasses { gpu, pipelines, field, batch, slot };
     passes.forward(&mut list);
-    passes.backward(&mut list, loss, slopes);
+    passes.backward(&mut list, slopes);
     list.submit(gpu);
     let n_lost = gpu.read::<u32>(&slopes.counts, 1).unwrap()[0];
     assert!(n_lost > N_RAYS * 7 * 8, "only {n_lost}");
@@ -305,9 +307,12 @@ fn every_kernel_parses_and_validates_and_structs_have_the_same_layout() {
                 Some("Batch") => size_of::<Batch>(),
                 Some("Ray") => size_of::<params::Ray>(),
                 Some("Span") => size_of::<Span>(),
-                Some("Space") => size_of::<params::Space>(),
+                Some("March") => size_of::<params::March>(),
+                Some("Visit") => size_of::<params::Visit>(),
+                Some("Backdrop") => size_of::<params::Backdrop>(),
                 Some("Level") => size_of::<Level>(),
                 Some("RayLoss") => size_of::<RayLoss>(),
+                Some("Pace") => size_of::<params::Pace>(),
                 Some("LearnRule") => size_of::<LearnRule>(),
                 _ => continue,
             };

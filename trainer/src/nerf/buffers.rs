@@ -1,7 +1,7 @@
 //! What the field and its samples take on the GPU.
 
 use super::kernels::{N_CHUNK, Widths};
-use super::params::{Batch, Level, Space, levels};
+use super::params::{Batch, LearnRule, Level, March, Ray, RayLoss, Visit, levels};
 use super::reference::grid::GridShape;
 use crate::Error;
 use crate::gpu::{Buffer, Gpu};
@@ -12,13 +12,12 @@ pub(crate) type Weights = Vec<Buffer>;
 /// All that is learned.
 #[derive(Debug)]
 pub(crate) struct FieldBuffers {
-    pub(crate) space: Buffer,
     pub(crate) levels: Buffer,
     /// Two f32 an entry.
     pub(crate) grid: Buffer,
     pub(crate) density: Weights,
     pub(crate) color: Weights,
-    /// `[images, n_code]`.
+    /// `[n_codes, n_code]`.
     pub(crate) codes: Buffer,
     pub(crate) n_levels: u32,
     pub(crate) n_entries: u32,
@@ -47,18 +46,74 @@ pub(crate) struct FieldMoments {
     pub(crate) color: Weights,
     /// Largest sum of slopes of each level.
     pub(crate) largest: Buffer,
-    /// Steps so far.
+    /// Steps so far, and visits of cells so far.
     pub(crate) steps: Buffer,
+    /// How far the next step goes.
+    pub(crate) pace: Buffer,
 }
 
-/// Rays, their samples, and what is worked out of them.
+/// Where something is: the cells that rays are walked through.
+#[derive(Debug)]
+pub(crate) struct Occupancy {
+    /// A bit a cell.
+    pub(crate) occupied: Buffer,
+    /// An f32 a cell: the share of light that it lately held back over a step; negative: never visited; 0: never looked at.
+    pub(crate) thickness: Buffer,
+    pub(crate) thickness_sum: Buffer,
+    pub(crate) visit: Buffer,
+    pub(crate) n_points: u32,
+    pub(crate) n_cells: u32,
+}
+
+impl Occupancy {
+    /// All cells hold something as far as anyone knows; where there is depth it is left to the depth to say so.
+    pub(crate) fn new(gpu: &Gpu, visit: &Visit, has_depth: bool) -> Result<Self, Error> {
+        let n = visit.n_cells.pow(3) as usize;
+        Ok(Self {
+            occupied: gpu.storage_with("nerf.occupied", &vec![255; n / 8])?,
+            thickness: gpu.storage_with(
+                "nerf.thickness",
+                bytemuck::cast_slice(&vec![if has_depth { 0.0f32 } else { -1.0 }; n]),
+            )?,
+            thickness_sum: gpu.storage("nerf.thickness_sum", 4)?,
+            visit: gpu.uniform_with("nerf.visit", visit),
+            n_points: visit.n_points,
+            n_cells: visit.n_cells,
+        })
+    }
+}
+
+/// The rays of one step or of part of a picture, and how they are looked along.
+#[derive(Debug)]
+pub(crate) struct RaySlot {
+    pub(crate) n_rays: u32,
+    pub(crate) rays: Buffer,
+    /// Pieces found along each ray.
+    pub(crate) n_found: Buffer,
+    pub(crate) march: Buffer,
+    pub(crate) loss: Buffer,
+}
+
+impl RaySlot {
+    pub(crate) fn new(gpu: &Gpu, n_rays: u32) -> Result<Self, Error> {
+        Ok(Self {
+            n_rays,
+            rays: gpu.storage("nerf.rays", u64::from(n_rays) * size_of::<Ray>() as u64)?,
+            n_found: gpu.storage("nerf.n_found", 4 * u64::from(n_rays))?,
+            march: gpu.uniform_with("nerf.march", &<March as bytemuck::Zeroable>::zeroed()),
+            loss: gpu.uniform_with("nerf.loss", &<RayLoss as bytemuck::Zeroable>::zeroed()),
+        })
+    }
+}
+
+/// The samples of rays, and what is worked out of them.
 #[derive(Debug)]
 pub(crate) struct BatchBuffers {
-    pub(crate) n_rays: u32,
     pub(crate) n_samples: u32,
     pub(crate) batch: Buffer,
-    pub(crate) rays: Buffer,
     pub(crate) spans: Buffer,
+    /// Middles of the samples in the unit cube, four f32 each.
+    pub(crate) points: Buffer,
     /// What the density's network is given, and what each of its layers holds.
     pub(crate) density: Vec<Buffer>,
     pub(crate) color: Vec<Buffer>,
@@ -77,21 +132,14 @@ fn weights(gpu: &Gpu, name: &str, widths: &[u32]) -> Result<Weights, Error> {
 
 impl FieldBuffers {
     /// A field of zeros.
-    pub(crate) fn new(
-        gpu: &Gpu,
-        shape: &GridShape,
-        widths: &Widths,
-        n_images: u32,
-        space: &Space,
-    ) -> Result<Self, Error> {
+    pub(crate) fn new(gpu: &Gpu, shape: &GridShape, widths: &Widths, n_codes: u32) -> Result<Self, Error> {
         let levels: Vec<Level> = levels(shape);
         Ok(Self {
-            space: gpu.uniform_with("nerf.space", space),
             levels: gpu.storage_with("nerf.levels", bytemuck::cast_slice(&levels))?,
             grid: gpu.storage("nerf.grid", 8 * u64::from(shape.n_entries_in_all()))?,
             density: weights(gpu, "nerf.density", &widths.density)?,
             color: weights(gpu, "nerf.color", &widths.color)?,
-            codes: gpu.storage("nerf.codes", 4 * u64::from(n_images.max(1)) * u64::from(widths.n_code.max(1)))?,
+            codes: gpu.storage("nerf.codes", 4 * u64::from(n_codes.max(1)) * u64::from(widths.n_code.max(1)))?,
             n_levels: u32::try_from(levels.len()).expect("a few levels"),
             n_entries: shape.n_entries_in_all(),
         })
@@ -111,7 +159,7 @@ impl FieldSlopes {
 }
 
 impl FieldMoments {
-    pub(crate) fn new(gpu: &Gpu, shape: &GridShape, widths: &Widths) -> Result<Self, Error> {
+    pub(crate) fn new(gpu: &Gpu, shape: &GridShape, widths: &Widths, rule: &LearnRule) -> Result<Self, Error> {
         let pairs = |name: &str, widths: &[u32]| -> Result<Weights, Error> {
             widths.windows(2).map(|pair| gpu.storage(name, 8 * u64::from(pair[0]) * u64::from(pair[1]))).collect()
         };
@@ -120,7 +168,8 @@ impl FieldMoments {
             density: pairs("nerf.density_moments", &widths.density)?,
             color: pairs("nerf.color_moments", &widths.color)?,
             largest: gpu.storage("nerf.largest", 4 * shape.n_cells.len() as u64)?,
-            steps: gpu.storage("nerf.steps", 4)?,
+            steps: gpu.storage("nerf.steps", 8)?,
+            pace: gpu.storage_with("nerf.pace", bytemuck::bytes_of(&rule.first_pace()))?,
         })
     }
 }
@@ -137,11 +186,10 @@ impl BatchBuffers {
             widths.windows(2).map(|pair| floats("nerf.partial_sums", n_chunks, pair[0] * pair[1])).collect()
         };
         Ok(Self {
-            n_rays,
             n_samples,
-            batch: gpu.storage_with("nerf.batch", bytemuck::bytes_of(&Batch { n_rays: 0, n_samples: 0 }))?,
-            rays: floats("nerf.rays", n_rays, 12)?,
+            batch: gpu.storage_with("nerf.batch", bytemuck::bytes_of(&Batch::of(0)))?,
             spans: floats("nerf.spans", n_samples, 4)?,
+            points: floats("nerf.points", n_samples, 4)?,
             density: layers("nerf.density_layers", &widths.density)?,
             color: layers("nerf.color_layers", &widths.color)?,
             v_density: layers("nerf.v_density_layers", &widths.density)?,

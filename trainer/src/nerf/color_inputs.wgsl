@@ -5,6 +5,7 @@
 // writes    inputs [n_samples, N_IN]: 16 harmonics of the direction, 15 handed on, the code, zeros
 // twin      nerf/reference/field.rs
 
+#import folded
 #import ray_batch
 #import sh
 

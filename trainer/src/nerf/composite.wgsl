@@ -5,12 +5,15 @@
 // writes    seen [n_rays] (rgb before its background, transmittance), ray_errors [n_rays] (squared error of color, distance seen),
 //           v_log_density [n_samples], v_colors [n_samples]
 // twin      nerf/reference/ray.rs
-// source    Max 1995; distortion of Barron et al. 2022, equation 15, in one pass as in Sun et al. 2022
+// source    Max 1995; line of sight of Rematas et al. 2022, equations 9 to 12, with a band in place of a bell; distortion of Barron et al. 2022, equation 15, in one pass as in Sun et al. 2022
 //
 // Slopes are of the mean over the rays.
 
+#import folded
 #import ray_batch
 #import ray_loss
+#import density
+#import sample
 
 @group(0) @binding(0) var<storage, read> batch: Batch;
 @group(0) @binding(1) var<uniform> loss: RayLoss;
@@ -23,28 +26,9 @@
 @group(0) @binding(8) var<storage, read_write> v_log_density: array<f32>;
 @group(0) @binding(9) var<storage, read_write> v_colors: array<vec4f>;
 
-const MOST_LOG_DENSITY = 12.0;
-
-struct Sample {
-    begin_m: f32,
-    end_m: f32,
-    density: f32,
-    left: f32,         // of the light that comes to it
-    rgb: vec3f,
-    is_cut: bool,      // whether its density is the largest there is
-}
-
-fn sample_at(ix: u32) -> Sample {
-    let span = spans[ix];
-    let log_density = told[16u * ix];
-    let density = exp(min(log_density, MOST_LOG_DENSITY));
-    let rgb = 1.0 / (1.0 + exp(-colors[ix].rgb));
-    return Sample(span.begin_m, span.end_m, density, exp(-density * (span.end_m - span.begin_m)), rgb, log_density >= MOST_LOG_DENSITY);
-}
-
 // Where a distance lies between near and infinity, 0 to 1.
-fn place_of(t_m: f32) -> f32 {
-    return 1.0 - loss.near_m / max(t_m, loss.near_m);
+fn place_of(t: f32) -> f32 {
+    return 1.0 - loss.near / max(t, loss.near);
 }
 
 @compute @workgroup_size(64)
@@ -53,35 +37,40 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     if ray_ix >= batch.n_rays { return; }
     let ray = rays[ray_ix];
     let end = ray.first_sample + ray.n_samples;
+    let band = vec2f(ray.target_distance, loss.band + loss.band_frac * ray.target_distance);
+    let sight = select(0.0, 2.0 * loss.sight / f32(batch.n_rays), ray.target_distance > 0.0);
+    var at_reading = 0.0;     // sum of the weights close to what the depth camera saw
+    var off_reading = 0.0;    // sum of the squares of the others
     var rgb = vec3f(0.0);
-    var distance_m = 0.0;
+    var distance = 0.0;
     var transmittance = 1.0;
     var in_all = vec2f(0.0); // sums of weights, and of weights times places
     for (var ix = ray.first_sample; ix < end; ix++) {
         let sample = sample_at(ix);
         let weight = transmittance * (1.0 - sample.left);
         rgb += weight * sample.rgb;
-        distance_m += weight * 0.5 * (sample.begin_m + sample.end_m);
-        in_all += weight * vec2f(1.0, 0.5 * (place_of(sample.begin_m) + place_of(sample.end_m)));
+        distance += weight * 0.5 * (sample.begin + sample.end);
+        if is_close(sample, band) { at_reading += weight; } else { off_reading += weight * weight; }
+        in_all += weight * vec2f(1.0, 0.5 * (place_of(sample.begin) + place_of(sample.end)));
         transmittance *= sample.left;
     }
     seen[ray_ix] = vec4f(rgb, transmittance);
     let background = loss.background_srgb.rgb;
     let miss = rgb + transmittance * background - unpack4x8unorm(ray.target_rgb).rgb;
-    ray_errors[ray_ix] = vec2f(dot(miss, miss) / 3.0, distance_m);
+    ray_errors[ray_ix] = vec2f(dot(miss, miss) / 3.0, distance);
 
     let per_ray = 1.0 / f32(batch.n_rays);
     let is_seen = ray.target_rgb >= 0x01000000u;
     let v_rgb = select(vec3f(0.0), 2.0 / 3.0 * per_ray * miss, is_seen);
     var v_transmittance = dot(v_rgb, background);
     var v_distance = 0.0;
-    let miss_m = distance_m - (1.0 - transmittance) * ray.target_m;
-    if ray.target_m > 0.0 && abs(miss_m) < loss.distance_clip_m {
-        v_distance = loss.distance_per_m * per_ray * sign(miss_m);
-        v_transmittance += v_distance * ray.target_m;
+    let miss_far = distance - (1.0 - transmittance) * ray.target_distance;
+    if ray.target_distance > 0.0 && abs(miss_far) < loss.distance_clip {
+        v_distance = loss.distance_weight * per_ray * sign(miss_far);
+        v_transmittance += v_distance * ray.target_distance;
     }
     // What lies behind a sample is what all are worth less what lies in front of it and what it is worth itself.
-    var behind = dot(v_rgb, rgb) + v_distance * distance_m;
+    var behind = dot(v_rgb, rgb) + v_distance * distance + sight * (off_reading - (1.0 - at_reading) * at_reading);
     let spread = loss.distortion * per_ray;
     var before = vec2f(0.0);
     // What the weights' own slopes add to it takes a pass of its own.
@@ -90,7 +79,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         let sample = sample_at(ix);
         let weight = light * (1.0 - sample.left);
         behind += weight * spread_slope(sample, weight, before, in_all) * spread;
-        before += weight * vec2f(1.0, 0.5 * (place_of(sample.begin_m) + place_of(sample.end_m)));
+        before += weight * vec2f(1.0, 0.5 * (place_of(sample.begin) + place_of(sample.end)));
         light *= sample.left;
     }
     before = vec2f(0.0);
@@ -98,20 +87,26 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     for (var ix = ray.first_sample; ix < end; ix++) {
         let sample = sample_at(ix);
         let weight = light * (1.0 - sample.left);
-        let middle_m = 0.5 * (sample.begin_m + sample.end_m);
-        var worth = dot(v_rgb, sample.rgb) + v_distance * middle_m;
+        let middle = 0.5 * (sample.begin + sample.end);
+        var worth = dot(v_rgb, sample.rgb) + v_distance * middle;
+        worth += sight * select(weight, at_reading - 1.0, is_close(sample, band));
         if spread > 0.0 { worth += spread * spread_slope(sample, weight, before, in_all); }
-        before += weight * vec2f(1.0, 0.5 * (place_of(sample.begin_m) + place_of(sample.end_m)));
+        before += weight * vec2f(1.0, 0.5 * (place_of(sample.begin) + place_of(sample.end)));
         light *= sample.left;
         behind -= weight * worth;
-        let v_density = (sample.end_m - sample.begin_m) * (light * worth - behind - transmittance * v_transmittance);
+        let v_density = (sample.end - sample.begin) * (light * worth - behind - transmittance * v_transmittance);
         v_log_density[ix] = select(v_density * sample.density, 0.0, sample.is_cut);
         v_colors[ix] = vec4f(weight * v_rgb * sample.rgb * (1.0 - sample.rgb), 0.0);
     }
 }
 
+// Whether a sample lies where the depth camera saw something: band is its distance and what it may be off by.
+fn is_close(sample: Sample, band: vec2f) -> bool {
+    return abs(0.5 * (sample.begin + sample.end) - band.x) <= band.y;
+}
+
 fn spread_slope(sample: Sample, weight: f32, before: vec2f, in_all: vec2f) -> f32 {
-    let places = vec2f(place_of(sample.begin_m), place_of(sample.end_m));
+    let places = vec2f(place_of(sample.begin), place_of(sample.end));
     let middle = 0.5 * (places.x + places.y);
     let after = in_all - before - weight * vec2f(1.0, middle);
     let apart = middle * before.x - before.y + after.y - middle * after.x;

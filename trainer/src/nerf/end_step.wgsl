@@ -1,12 +1,15 @@
 // end_step: counts the step, and scales the next slopes of each level so that sums keep 8 bits of room.
 //
 // threads   one per level
-// reads     largest [n_levels] of this step's sums, counts ([0]: contributions that were too large)
-// writes    scales [n_levels], largest (zero again), counts ([0] zero again, [1]: too large so far), steps
+// reads     rule, largest [n_levels] of this step's sums, counts ([0]: contributions that were too large)
+// writes    scales [n_levels], largest (zero again), counts ([0] zero again, [1]: too large so far), steps, pace
 //
 // Every level's slopes are scaled by a power of two of its own, from what its largest sum was.
 
+#import learn_rule
 
+@group(0) @binding(4) var<uniform> rule: LearnRule;
+@group(0) @binding(5) var<storage, read_write> pace: Pace;
 @group(0) @binding(0) var<storage, read_write> scales: array<f32>;
 @group(0) @binding(1) var<storage, read_write> largest: array<u32>;
 @group(0) @binding(2) var<storage, read_write> counts: array<u32>;
@@ -31,5 +34,6 @@ fn main(@builtin(local_invocation_index) lane: u32) {
         counts[1] += n_lost;
         counts[0] = 0u;
         steps[0] += 1u;
+        pace = pace_at(rule, f32(steps[0]));
     }
 }

@@ -17,8 +17,18 @@ macro_rules! kernel {
 }
 
 const SHARED: &[Source] = &[
+    shared!("folded"),
     shared!("ray_batch"),
+    shared!("march_params"),
     shared!("space"),
+    shared!("march"),
+    shared!("density"),
+    shared!("sample"),
+    shared!("scan"),
+    shared!("view"),
+    shared!("picture_ray"),
+    shared!("visit"),
+    shared!("random"),
     shared!("hash_grid"),
     shared!("ray_loss"),
     shared!("learn_rule"),
@@ -28,6 +38,16 @@ const SHARED: &[Source] = &[
 /// All kernels of this folder.
 #[cfg(test)]
 pub(crate) const KERNELS: &[Kernel] = &[
+    kernel!("count_samples"),
+    kernel!("place_samples"),
+    kernel!("write_samples"),
+    kernel!("hint_cells"),
+    kernel!("visit_cells"),
+    kernel!("note_cells"),
+    kernel!("sum_cells"),
+    kernel!("mark_cells"),
+    kernel!("picture_rays"),
+    kernel!("show_rays"),
     kernel!("look_up"),
     kernel!("layer_forward"),
     kernel!("layer_backward"),
@@ -74,6 +94,17 @@ pub(crate) struct LayerPipelines {
 /// All that draws and learns a field.
 #[derive(Debug)]
 pub(crate) struct FieldPipelines {
+    pub(crate) count_samples: Pipeline,
+    pub(crate) place_samples: Pipeline,
+    pub(crate) write_samples: Pipeline,
+    /// One a kind of hint, in the order in which they are taken.
+    pub(crate) hint_cells: [Pipeline; 3],
+    pub(crate) visit_cells: Pipeline,
+    pub(crate) note_cells: Pipeline,
+    pub(crate) sum_cells: Pipeline,
+    pub(crate) mark_cells: Pipeline,
+    pub(crate) picture_rays: Pipeline,
+    pub(crate) show_rays: Pipeline,
     pub(crate) look_up: Pipeline,
     pub(crate) density: Vec<LayerPipelines>,
     pub(crate) color_inputs: Pipeline,
@@ -88,21 +119,34 @@ pub(crate) struct FieldPipelines {
 }
 
 impl FieldPipelines {
-    pub(crate) fn new(gpu: &Gpu, widths: &Widths) -> Result<Self, Error> {
+    /// For batches of at most `n_samples`; rays of pictures have the code `no_image`.
+    pub(crate) fn new(gpu: &Gpu, widths: &Widths, n_samples: u32, no_image: u32) -> Result<Self, Error> {
         let n_inputs = f64::from(widths.color[0]);
         let code = [("N_IN", n_inputs), ("N_CODE", f64::from(widths.n_code))];
+        let hint = |kind: f64| Pipeline::new(gpu, kernel!("hint_cells"), &[("KIND", kind)]);
+        let plain = |kernel: Kernel| Pipeline::new(gpu, kernel, &[]);
         Ok(Self {
-            look_up: Pipeline::new(gpu, kernel!("look_up"), &[])?,
+            count_samples: plain(kernel!("count_samples"))?,
+            place_samples: Pipeline::new(gpu, kernel!("place_samples"), &[("CAPACITY", n_samples.into())])?,
+            write_samples: plain(kernel!("write_samples"))?,
+            hint_cells: [hint(0.0)?, hint(1.0)?, hint(2.0)?],
+            visit_cells: plain(kernel!("visit_cells"))?,
+            note_cells: plain(kernel!("note_cells"))?,
+            sum_cells: plain(kernel!("sum_cells"))?,
+            mark_cells: plain(kernel!("mark_cells"))?,
+            picture_rays: Pipeline::new(gpu, kernel!("picture_rays"), &[("NO_IMAGE", no_image.into())])?,
+            show_rays: plain(kernel!("show_rays"))?,
+            look_up: plain(kernel!("look_up"))?,
             density: layers(gpu, &widths.density)?,
             color_inputs: Pipeline::new(gpu, kernel!("color_inputs"), &code)?,
             color: layers(gpu, &widths.color)?,
-            composite: Pipeline::new(gpu, kernel!("composite"), &[])?,
+            composite: plain(kernel!("composite"))?,
             told_backward: Pipeline::new(gpu, kernel!("told_backward"), &code[..1])?,
-            sum_chunks: Pipeline::new(gpu, kernel!("sum_chunks"), &[])?,
-            scatter: Pipeline::new(gpu, kernel!("scatter"), &[])?,
-            learn_weights: Pipeline::new(gpu, kernel!("learn_weights"), &[])?,
-            learn_grid: Pipeline::new(gpu, kernel!("learn_grid"), &[])?,
-            end_step: Pipeline::new(gpu, kernel!("end_step"), &[])?,
+            sum_chunks: plain(kernel!("sum_chunks"))?,
+            scatter: plain(kernel!("scatter"))?,
+            learn_weights: plain(kernel!("learn_weights"))?,
+            learn_grid: plain(kernel!("learn_grid"))?,
+            end_step: plain(kernel!("end_step"))?,
         })
     }
 }

@@ -5,6 +5,7 @@
 // writes    v_inputs [n_samples, N_IN], zero where the input was cut and CUT says that it may be
 // twin      nerf/reference/network.rs
 
+#import folded
 #import ray_batch
 
 @group(0) @binding(0) var<storage, read> batch: Batch;

@@ -7,6 +7,7 @@
 //
 // Widths are multiples of 4; threads beside each other share what they read, so that it comes out of the nearest cache.
 
+#import folded
 #import ray_batch
 
 @group(0) @binding(0) var<storage, read> batch: Batch;

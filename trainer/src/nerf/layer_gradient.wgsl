@@ -5,6 +5,7 @@
 // writes    partial_sums [n_chunks, N_OUT, N_IN]
 // twin      nerf/reference/network.rs
 
+#import folded
 #import ray_batch
 
 @group(0) @binding(0) var<storage, read> batch: Batch;

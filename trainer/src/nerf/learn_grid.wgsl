@@ -1,16 +1,17 @@
 // learn_grid: one step of Adam for the entries of the grid that a sample has touched, and the largest sum of each level.
 //
 // threads   one per entry
-// reads     rule, steps ([0]: steps so far), levels [n_levels], scales [n_levels]
+// reads     rule, pace, levels [n_levels], scales [n_levels]
 // writes    grid, moments [n_entries] (first of both, second of both), v_grid (zero again), largest [n_levels]
 // twin      optim/reference.rs
 // source    Mueller et al. 2022, section 4 (entries without a slope are left alone)
 
+#import folded
 #import hash_grid
 #import learn_rule
 
 @group(0) @binding(0) var<uniform> rule: LearnRule;
-@group(0) @binding(1) var<storage, read> steps: array<u32>;
+@group(0) @binding(1) var<storage, read> pace: Pace;
 @group(0) @binding(2) var<storage, read> levels: array<Level>;
 @group(0) @binding(3) var<storage, read> scales: array<f32>;
 @group(0) @binding(4) var<storage, read_write> grid: array<vec2f>;
@@ -20,7 +21,7 @@
 
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
-    let ix = (wg.y * n_wgs.x + wg.x) * 256u + lane;
+    let ix = folded(wg, n_wgs) * 256u + lane;
     if ix >= arrayLength(&grid) { return; }
     let sum = v_grid[ix];
     if all(sum == vec2i(0)) { return; }
@@ -30,9 +31,8 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let most = max(abs(sum.x), abs(sum.y));
     atomicMax(&largest[level], u32(most)); // The order of a maximum does not matter.
     let v = vec2f(sum) / scales[level];
-    let step = f32(steps[0]);
     let moment = mix(vec4f(v, v * v), moments[ix], rule.betas.xxyy);
     moments[ix] = moment;
-    let corrected = moment * correction_at(rule, step).xxyy;
-    grid[ix] -= rate_at(rule, step) * corrected.xy / (sqrt(corrected.zw) + rule.epsilon);
+    let corrected = moment * pace.correction.xxyy;
+    grid[ix] -= rule.rate * pace.rate_frac * corrected.xy / (sqrt(corrected.zw) + rule.epsilon);
 }

@@ -1,22 +1,20 @@
-// look_up: what the grid holds around the middle of every sample.
+// look_up: what the grid holds around every point.
 //
 // threads   one per sample and level
-// reads     batch, space, levels [n_levels], rays, spans [n_samples], grid [n_entries]
+// reads     batch, levels [n_levels], points [n_samples] (in the unit cube), grid [n_entries]
 // writes    features [n_samples, n_levels]
 // twin      nerf/reference/grid.rs
 // source    Mueller et al. 2022
 
+#import folded
 #import ray_batch
-#import space
 #import hash_grid
 
 @group(0) @binding(0) var<storage, read> batch: Batch;
-@group(0) @binding(1) var<uniform> space: Space;
-@group(0) @binding(2) var<storage, read> levels: array<Level>;
-@group(0) @binding(3) var<storage, read> rays: array<Ray>;
-@group(0) @binding(4) var<storage, read> spans: array<Span>;
-@group(0) @binding(5) var<storage, read> grid: array<vec2f>;
-@group(0) @binding(6) var<storage, read_write> features: array<vec2f>;
+@group(0) @binding(1) var<storage, read> levels: array<Level>;
+@group(0) @binding(2) var<storage, read> points: array<vec4f>;
+@group(0) @binding(3) var<storage, read> grid: array<vec2f>;
+@group(0) @binding(4) var<storage, read_write> features: array<vec2f>;
 
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
@@ -25,8 +23,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let sample = ix / n_levels;
     if sample >= batch.n_samples { return; }
     let level = levels[ix % n_levels];
-    let span = spans[sample];
-    let cell = cell_of(level, contract(space, middle_of(rays[span.ray], span)));
+    let cell = cell_of(level, points[sample].xyz);
     var found = vec2f(0.0);
     for (var corner = 0u; corner < 8u; corner++) {
         let step = step_of(corner);

@@ -3,7 +3,22 @@
 #[cfg(test)]
 mod against_twin;
 mod buffers;
+mod carve;
+mod extent;
 mod kernels;
+mod learner;
+#[cfg(test)]
+mod march_against_twin;
+mod model;
+mod options;
 mod params;
 mod passes;
+mod rays;
 pub mod reference;
+mod sizes;
+#[cfg(test)]
+mod tests;
+
+pub use extent::Extent;
+pub use model::NerfModel;
+pub use options::{Effort, NerfOptions};

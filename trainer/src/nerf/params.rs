@@ -2,47 +2,83 @@
 
 use super::reference::grid::GridShape;
 
-/// `Batch` of shared/ray_batch.wgsl.
+/// `Batch` of `shared/ray_batch.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct Batch {
     pub(crate) n_rays: u32,
     pub(crate) n_samples: u32,
-}
-
-/// `Ray` of shared/ray_batch.wgsl.
-#[repr(C)]
-#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-pub(crate) struct Ray {
-    pub(crate) origin_m: [f32; 3],
-    pub(crate) first_sample: u32,
-    pub(crate) direction: [f32; 3],
-    pub(crate) n_samples: u32,
-    pub(crate) code: u32,
-    pub(crate) target_rgb: u32,
-    pub(crate) target_m: f32,
+    pub(crate) most_samples: u32,
     pub(crate) unused: u32,
 }
 
-/// `Span` of shared/ray_batch.wgsl.
+impl Batch {
+    /// Rays whose samples are to be found.
+    pub(crate) fn of(n_rays: u32) -> Self {
+        Self { n_rays, n_samples: 0, most_samples: 0, unused: 0 }
+    }
+}
+
+/// `Ray` of `shared/ray_batch.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct Ray {
+    pub(crate) origin: [f32; 3],
+    pub(crate) first_sample: u32,
+    pub(crate) direction: [f32; 3],
+    pub(crate) n_samples: u32,
+    pub(crate) begin: f32,
+    pub(crate) end: f32,
+    pub(crate) code: u32,
+    pub(crate) target_rgb: u32,
+    pub(crate) target_distance: f32,
+    pub(crate) shift: f32,
+    pub(crate) is_ended: u32,
+    pub(crate) unused: u32,
+}
+
+/// `Span` of `shared/ray_batch.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct Span {
-    pub(crate) begin_m: f32,
-    pub(crate) end_m: f32,
+    pub(crate) begin: f32,
+    pub(crate) end: f32,
     pub(crate) ray: u32,
     pub(crate) unused: u32,
 }
 
-/// `Space` of shared/space.wgsl.
+/// `March` of `shared/march_params.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-pub(crate) struct Space {
-    pub(crate) center_m: [f32; 3],
+pub(crate) struct March {
+    pub(crate) step: f32,
+    pub(crate) most_samples: u32,
+    pub(crate) n_cells: u32,
+    pub(crate) first_ray: u32,
+    pub(crate) most_found: u32,
+    pub(crate) explore_key: u32,
+    pub(crate) unused: [u32; 2],
+}
+
+/// `Visit` of `shared/visit.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct Visit {
+    pub(crate) n_cells: u32,
+    pub(crate) n_points: u32,
+    pub(crate) kept_frac: f32,
+    pub(crate) step: f32,
+}
+
+/// `Backdrop` of `show_rays.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct Backdrop {
+    pub(crate) srgb: [f32; 3],
     pub(crate) radius_m: f32,
 }
 
-/// `Level` of shared/hash_grid.wgsl.
+/// `Level` of `shared/hash_grid.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct Level {
@@ -52,18 +88,22 @@ pub(crate) struct Level {
     pub(crate) unused: u32,
 }
 
-/// `RayLoss` of shared/ray_loss.wgsl.
+/// `RayLoss` of `shared/ray_loss.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct RayLoss {
     pub(crate) background_srgb: [f32; 4],
-    pub(crate) distance_per_m: f32,
-    pub(crate) distance_clip_m: f32,
+    pub(crate) distance_weight: f32,
+    pub(crate) distance_clip: f32,
     pub(crate) distortion: f32,
-    pub(crate) near_m: f32,
+    pub(crate) near: f32,
+    pub(crate) sight: f32,
+    pub(crate) band: f32,
+    pub(crate) band_frac: f32,
+    pub(crate) unused: f32,
 }
 
-/// `LearnRule` of shared/learn_rule.wgsl.
+/// `LearnRule` of `shared/learn_rule.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct LearnRule {
@@ -74,6 +114,22 @@ pub(crate) struct LearnRule {
     pub(crate) pull: f32,
     pub(crate) n_planned_steps: f32,
     pub(crate) unused: f32,
+}
+
+/// `Pace` of `shared/learn_rule.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct Pace {
+    pub(crate) rate_frac: f32,
+    pub(crate) unused: f32,
+    pub(crate) correction: [f32; 2],
+}
+
+impl LearnRule {
+    /// Of the first step.
+    pub(crate) fn first_pace(&self) -> Pace {
+        Pace { rate_frac: 1.0, unused: 0.0, correction: self.betas.map(|beta| 1.0 / (1.0 - beta)) }
+    }
 }
 
 /// The levels of a grid as the kernels read them.

@@ -5,6 +5,7 @@
 // writes    v_told [n_samples, 16]
 // twin      nerf/reference/field.rs
 
+#import folded
 #import ray_batch
 
 @group(0) @binding(0) var<storage, read> batch: Batch;

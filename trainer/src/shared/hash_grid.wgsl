@@ -1,4 +1,4 @@
-// hash_grid: which entries of a level a point lies between. After `space`.
+// hash_grid: which entries of a level a point lies between.
 
 struct Level {
     n_cells: u32,

@@ -10,11 +10,14 @@ struct LearnRule {
     unused: f32,
 }
 
-fn rate_at(rule: LearnRule, step: f32) -> f32 {
-    return rule.rate * pow(rule.final_rate_frac, clamp(step / max(rule.n_planned_steps, 1.0), 0.0, 1.0));
+// How far the next step goes; made anew at the end of each.
+struct Pace {
+    rate_frac: f32,        // of the rate at the start
+    unused: f32,
+    correction: vec2f,     // one over what is missing from the means over the steps so far
 }
 
-// One over what is missing from the means over the steps so far.
-fn correction_at(rule: LearnRule, step: f32) -> vec2f {
-    return 1.0 / (1.0 - pow(rule.betas, vec2f(step + 1.0)));
+fn pace_at(rule: LearnRule, step: f32) -> Pace {
+    let rate_frac = pow(rule.final_rate_frac, clamp(step / max(rule.n_planned_steps, 1.0), 0.0, 1.0));
+    return Pace(rate_frac, 0.0, 1.0 / (1.0 - pow(rule.betas, vec2f(step + 1.0))));
 }

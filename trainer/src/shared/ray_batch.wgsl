@@ -3,31 +3,29 @@
 struct Batch {
     n_rays: u32,
     n_samples: u32,
+    most_samples: u32,      // of a ray, so that all rays find room
+    unused: u32,
 }
 
 struct Ray {
-    origin_m: vec3f,
+    origin: vec3f,          // in units of the scene's radius, as all lengths here
     first_sample: u32,
     direction: vec3f,       // of length 1
     n_samples: u32,
+    begin: f32,             // along the ray: what lies before is not looked at
+    end: f32,
     code: u32,              // of the image it belongs to
     target_rgb: u32,        // rgba8; a = 0: not seen
-    target_m: f32,          // distance along the ray, metres; 0: unknown
+    target_distance: f32,   // along the ray; 0: unknown
+    shift: f32,             // of its samples, in steps, 0 to 1
+    is_ended: u32,          // 1: of a picture, and nothing more can be seen along it
     unused: u32,
 }
 
 // A piece of a ray.
 struct Span {
-    begin_m: f32,
-    end_m: f32,
+    begin: f32,
+    end: f32,
     ray: u32,
     unused: u32,
-}
-
-fn folded(wg: vec3u, n_wgs: vec3u) -> u32 {
-    return wg.y * n_wgs.x + wg.x;
-}
-
-fn middle_of(ray: Ray, span: Span) -> vec3f {
-    return ray.origin_m + 0.5 * (span.begin_m + span.end_m) * ray.direction;
 }

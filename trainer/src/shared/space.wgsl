@@ -1,15 +1,9 @@
-// space: the world in the unit cube.
-
-struct Space {
-    center_m: vec3f,
-    radius_m: f32,          // half an edge of the inner cube
-}
+// space: the world, in units of the scene's radius around its middle, in the unit cube.
 
 // twin: nerf/reference/space.rs
-fn contract(space: Space, world_m: vec3f) -> vec3f {
-    let scaled = (world_m - space.center_m) / space.radius_m;
-    let size = abs(scaled);
+fn contract(at: vec3f) -> vec3f {
+    let size = abs(at);
     let largest = max(size.x, max(size.y, size.z));
-    let drawn_in = scaled * select(1.0, (2.0 - 1.0 / largest) / largest, largest > 1.0);
+    let drawn_in = at * select(1.0, (2.0 - 1.0 / largest) / largest, largest > 1.0);
     return (drawn_in + 2.0) / 4.0;
 }

@@ -31,6 +31,7 @@ mod views;
 pub use camera_terms::{CameraFix, PosedLens, TermSet};
 pub(crate) use camera_terms::{drift_share, moved, shares_lens};
 pub use options::SplatOptions;
-pub(crate) use params::{Camera, LOW_PASS_PX2, View};
+pub(crate) use params::{Camera, View};
 pub use trainer::SplatTrainer;
 pub use trials::{CameraChoice, Candidate, CountChoice, Trial};
+pub(crate) use views::{depth_in_color_view, median_depth_m};

@@ -1,7 +1,7 @@
 //! Small structs the kernels read, with the layouts of their WGSL twins.
 
 use crate::gpu::{f32_of, f32s_of};
-use crate::{Aabb, Shutter};
+use crate::{Aabb, RenderRequest, Shutter};
 use kinematics::Transform;
 
 /// Edge of a tile, pixels.
@@ -47,6 +47,21 @@ pub(crate) struct Camera {
 pub(crate) const LOW_PASS_PX2: f64 = 0.3;
 
 impl Camera {
+    /// The pinhole camera that a picture is asked from.
+    pub(crate) fn of_request(request: &RenderRequest, focal_px: [f64; 2], principal_px: [f64; 2]) -> Self {
+        Self {
+            world_from_camera: request.world_from_camera,
+            size_px: request.size_px,
+            focal_px,
+            principal_px,
+            shutter: request.shutter,
+            near_m: request.near_m,
+            far_m: request.far_m,
+            crop: request.crop,
+            low_pass_px2: LOW_PASS_PX2,
+        }
+    }
+
     /// The same camera with an image `2^level` times smaller; rows and columns left over at the edges are cut.
     pub(crate) fn at_level(&self, level: u32) -> Self {
         let share = 0.5f64.powi(i32::try_from(level).expect("a few levels"));

@@ -11,7 +11,7 @@ use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_bins, n_sh_res
 use super::camera_terms::{CameraFix, CameraTerms, PosedLens, TermSet};
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::options::SplatOptions;
-use super::params::{Camera, Growth, LOW_PASS_PX2, Rule, Supervision, View, status};
+use super::params::{Camera, Growth, Rule, Supervision, View, status};
 use super::passes::{self, GrowthBuffers, Target, ViewPasses};
 use super::seed::{self, Density, Seeder};
 use super::trials::{CameraChoice, Candidate, Due, HeldBack, Now, Trial, Trials};
@@ -884,17 +884,7 @@ impl Method for SplatTrainer {
         self.seed_from_depth()?;
         match request.projection {
             Projection::Pinhole { focal_px, principal_px } => {
-                let camera = Camera {
-                    world_from_camera: request.world_from_camera,
-                    size_px: request.size_px,
-                    focal_px,
-                    principal_px,
-                    shutter: request.shutter,
-                    near_m: request.near_m,
-                    far_m: request.far_m,
-                    crop: request.crop,
-                    low_pass_px2: LOW_PASS_PX2,
-                };
+                let camera = Camera::of_request(request, focal_px, principal_px);
                 self.draw_view(&camera, request.background_srgb)
             }
             Projection::Equirectangular => {

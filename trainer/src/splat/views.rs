@@ -140,7 +140,7 @@ impl LevelImages {
     }
 }
 
-fn median_depth_m(keyframe: &Keyframe) -> Option<f64> {
+pub(crate) fn median_depth_m(keyframe: &Keyframe) -> Option<f64> {
     let depth = keyframe.depth.as_ref()?;
     // Some of each column and row, and enough of small images.
     let step = 997.min(depth.depth_m.len() / 64).max(1);
@@ -209,13 +209,13 @@ fn shrunk_depth(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Vec<f32> 
 /// Depth along the color camera's z for each of its pixels; empty where the keyframe has none.
 ///
 /// A depth camera with its own lens, pose or moment is carried over point by point; the nearest wins.
-fn depth_in_color_view(keyframe: &Keyframe) -> Vec<f32> {
-    let Some(depth) = &keyframe.depth else { return Vec::new() };
+pub(crate) fn depth_in_color_view(keyframe: &Keyframe) -> Arc<[f32]> {
+    let Some(depth) = &keyframe.depth else { return [].into() };
     let same_lens = depth.size_px == keyframe.size_px
         && depth.focal_px == keyframe.focal_px
         && depth.principal_px == keyframe.principal_px;
     if same_lens && depth.world_from_camera == keyframe.world_from_camera {
-        return depth.depth_m.to_vec();
+        return depth.depth_m.clone();
     }
     let color_from_depth = keyframe.world_from_camera.inverse() * depth.world_from_camera;
     let [width, height] = keyframe.size_px;
@@ -238,5 +238,5 @@ fn depth_in_color_view(keyframe: &Keyframe) -> Vec<f32> {
             *place = nearer;
         }
     }
-    carried
+    carried.into()
 }

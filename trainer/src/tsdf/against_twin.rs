@@ -3,10 +3,10 @@
 use super::block::{Blocks, N_VOXELS, Place, stored_distance};
 use super::chosen::Lattice;
 use super::reference::{self, Ray, VoxelBlocks};
-use super::scenes::{self, FOCAL_PX, PRINCIPAL_PX, SIZE_PX};
 use super::{TsdfModel, TsdfOptions};
 use crate::gpu::{Gpu, GpuOptions};
 use crate::mismatches::Mismatches;
+use crate::test_scenes::{self as scenes, FOCAL_PX, PRINCIPAL_PX, SIZE_PX};
 use crate::{Keyframe, Method, RenderRequest};
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};

@@ -16,8 +16,6 @@ pub mod reference;
 #[cfg(test)]
 mod against_twin;
 #[cfg(test)]
-mod scenes;
-#[cfg(test)]
 mod tests;
 
 pub use chosen::Lattice;

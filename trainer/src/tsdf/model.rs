@@ -15,9 +15,9 @@ use super::passes::{self, Canvas, FrameSlot};
 use crate::align::Alignment;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming, Passes, PendingRead};
-use crate::splat::{Camera, LOW_PASS_PX2, PosedLens};
+use crate::seen::Seen;
+use crate::splat::{Camera, PosedLens};
 use crate::{Error, Keyframe, Method, Part, Picture, Progress, Projection, RenderRequest, Split};
-use checkpoint::Name;
 use kinematics::Stamp;
 use std::collections::{BTreeSet, VecDeque};
 use std::path::Path;
@@ -44,9 +44,9 @@ pub struct TsdfModel {
     passes: Passes,
     /// Not known to be fused, in order; the first of them may be in flight.
     pending: VecDeque<Arc<Keyframe>>,
-    fused: Vec<Name>,
+    fused: Vec<Seen>,
     /// Keyframes that a loaded state waits for; nobody may bring them.
-    to_match: Vec<Name>,
+    to_match: Vec<Seen>,
     in_flight: Option<InFlight>,
     /// Blocks that found no room on the GPU.
     waiting: Blocks,
@@ -185,7 +185,7 @@ impl TsdfModel {
     /// Takes the first pending keyframe for done.
     fn pass_over(&mut self) {
         if let Some(keyframe) = self.pending.pop_front() {
-            self.fused.push(Name::of(&keyframe));
+            self.fused.push(Seen::of(&keyframe));
             self.step += 1;
         }
     }
@@ -258,7 +258,7 @@ impl TsdfModel {
     /// Draws one pinhole view.
     fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3]) -> Result<Picture, Error> {
         if !self.record_picture(camera, background_srgb)? {
-            return Ok(empty_picture(camera.size_px, background_srgb));
+            return Ok(Picture::empty(camera.size_px, background_srgb));
         }
         self.passes.submit(&self.gpu);
         let canvas = self.canvas.as_ref().ok_or(Error::DeviceLost)?;
@@ -272,7 +272,7 @@ impl TsdfModel {
     pub fn profile_picture(&mut self, request: &RenderRequest) -> Result<Option<f64>, Error> {
         self.settle()?;
         let Projection::Pinhole { focal_px, principal_px } = request.projection else { return Ok(None) };
-        if !self.record_picture(&camera_of(request, focal_px, principal_px), request.background_srgb)? {
+        if !self.record_picture(&Camera::of_request(request, focal_px, principal_px), request.background_srgb)? {
             return Ok(None);
         }
         self.passes.submit_spanned(&self.gpu)
@@ -297,21 +297,6 @@ impl TsdfModel {
     }
 }
 
-/// The camera that a picture is asked from.
-fn camera_of(request: &RenderRequest, focal_px: [f64; 2], principal_px: [f64; 2]) -> Camera {
-    Camera {
-        world_from_camera: request.world_from_camera,
-        size_px: request.size_px,
-        focal_px,
-        principal_px,
-        shutter: request.shutter,
-        near_m: request.near_m,
-        far_m: request.far_m,
-        crop: request.crop,
-        low_pass_px2: LOW_PASS_PX2,
-    }
-}
-
 /// The camera, and what it is cropped to, in the field's frame.
 fn in_field(camera: &Camera, lattice: &Lattice) -> Camera {
     let field_from_world = lattice.field_from_world();
@@ -323,35 +308,12 @@ fn in_field(camera: &Camera, lattice: &Lattice) -> Camera {
     camera
 }
 
-/// A picture of nothing.
-fn empty_picture(size_px: [u32; 2], background_srgb: [f32; 3]) -> Picture {
-    let n = size_px[0] as usize * size_px[1] as usize;
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to 0 to 255")]
-    let [red, green, blue] = background_srgb.map(|part| (part.clamp(0.0, 1.0) * 255.0 + 0.5).floor() as u8);
-    Picture { size_px, rgba_srgb: [red, green, blue, 0].repeat(n), depth_m: vec![0.0; n] }
-}
-
-/// Refuses arrays that do not have their pixels.
-fn check(keyframe: &Keyframe) -> Result<(), Error> {
-    let [width, height] = keyframe.size_px;
-    let expected = 4 * width as usize * height as usize;
-    if keyframe.rgba_srgb.len() != expected {
-        return Err(Error::PictureBytes { what: "keyframe", width, height, got: keyframe.rgba_srgb.len(), expected });
-    }
-    let Some(depth) = &keyframe.depth else { return Ok(()) };
-    let expected = depth.size_px[0] as usize * depth.size_px[1] as usize;
-    if depth.depth_m.len() != expected {
-        return Err(Error::DepthSize { rendered: depth.depth_m.len(), truth: expected });
-    }
-    Ok(())
-}
-
 impl Method for TsdfModel {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         if keyframe.split == Split::Test || keyframe.depth.is_none() {
             return Ok(());
         }
-        check(&keyframe)?;
+        keyframe.check()?;
         self.pending.push_back(keyframe);
         Ok(())
     }
@@ -430,7 +392,7 @@ impl Method for TsdfModel {
         self.fuse_first()?;
         match request.projection {
             Projection::Pinhole { focal_px, principal_px } => {
-                let camera = camera_of(request, focal_px, principal_px);
+                let camera = Camera::of_request(request, focal_px, principal_px);
                 self.draw_view(&camera, request.background_srgb)
             }
             Projection::Equirectangular => {

@@ -1,10 +1,10 @@
 //! The model as a whole: what it draws, carves, keeps and gives up.
 #![expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "shares of small counts")]
 
-use super::scenes::{self, SIZE_PX, Shape};
 use super::{TsdfModel, TsdfOptions};
 use crate::checkpoint::Checkpoint;
 use crate::gpu::{Gpu, GpuOptions};
+use crate::test_scenes::{self as scenes, SIZE_PX, Shape};
 use crate::{Aabb, Error, Keyframe, Method, Picture, Projection, RenderRequest};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, Vector3};

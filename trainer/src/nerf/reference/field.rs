@@ -2,7 +2,7 @@
 
 use super::grid::{self, GridShape, N_FEATURES};
 use super::network::Network;
-use super::space::Space;
+use super::space::{contract, contract_backward};
 
 /// Numbers that the first network hands on to the second, after the density.
 pub const N_HANDED_ON: usize = 15;
@@ -11,11 +11,12 @@ pub const N_DIRECTION: usize = 16;
 /// The logarithm of the density ends here, so that no density is infinite.
 pub const MOST_LOG_DENSITY: f64 = 12.0;
 
+/// Added to what the network tells of the logarithm: a field that knows nothing is thin.
+pub const FIRST_LOG_DENSITY: f64 = 0.0;
+
 /// All parameters of a field.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Field {
-    /// Where the scene lies.
-    pub space: Space,
     /// Sizes of the grid.
     pub shape: GridShape,
     /// Entries of the grid.
@@ -51,7 +52,7 @@ impl FieldGrad {
 /// What a point is like, and what it was computed from.
 #[derive(Clone, Debug)]
 pub struct Point {
-    /// Per metre.
+    /// Per unit of length, which is the scene's radius.
     pub density: f64,
     /// 0 to 1.
     pub rgb: [f64; 3],
@@ -66,12 +67,12 @@ impl Field {
         [vec![shape.n_outputs(), width, 1 + N_HANDED_ON], vec![N_DIRECTION + N_HANDED_ON + n_code, width, width, 3]]
     }
 
-    /// Density and color of a point in world, metres, looked at along a direction of length 1, in an image with a code.
-    pub fn point(&self, world_m: [f64; 3], direction: [f64; 3], code: &[f64]) -> Point {
-        let contracted = self.space.contract(world_m);
+    /// Density and color of a point, in units of the scene's radius around its middle, looked at along a direction of length 1, in an image with a code.
+    pub fn point(&self, at: [f64; 3], direction: [f64; 3], code: &[f64]) -> Point {
+        let contracted = contract(at);
         let density_layers = self.density.forward(&grid::look_up(&self.shape, &self.table, contracted));
         let out = density_layers.last().expect("an output layer");
-        let density = out[0].min(MOST_LOG_DENSITY).exp();
+        let density = (out[0] + FIRST_LOG_DENSITY).min(MOST_LOG_DENSITY).exp();
         let input = [&harmonics(direction)[..], &out[1..], code].concat();
         let color_layers = self.color.forward(&input);
         let out = color_layers.last().expect("an output layer");
@@ -79,11 +80,11 @@ impl Field {
         Point { density, rgb, contracted, density_layers, color_layers }
     }
 
-    /// Carries slopes towards density and color back to the parameters, where they add up; those towards the point in world and
+    /// Carries slopes towards density and color back to the parameters, where they add up; those towards the point and
     /// towards the image's code come back.
     pub fn point_backward(
         &self,
-        world_m: [f64; 3],
+        at: [f64; 3],
         point: &Point,
         v_density: f64,
         v_rgb: [f64; 3],
@@ -93,12 +94,12 @@ impl Field {
         let v_input = self.color.backward(&point.color_layers, &v_out, &mut gradient.color);
         let (v_handed_on, v_code) = v_input[N_DIRECTION..].split_at(N_HANDED_ON);
         let log_density = point.density_layers.last().expect("an output layer")[0];
-        let v_log = if log_density < MOST_LOG_DENSITY { v_density * point.density } else { 0.0 };
+        let v_log = if log_density + FIRST_LOG_DENSITY < MOST_LOG_DENSITY { v_density * point.density } else { 0.0 };
         let v_out = [&[v_log][..], v_handed_on].concat();
         let v_found = self.density.backward(&point.density_layers, &v_out, &mut gradient.density);
         let v_contracted =
             grid::look_up_backward(&self.shape, &self.table, point.contracted, &v_found, &mut gradient.table);
-        (self.space.contract_backward(world_m, v_contracted), v_code.to_vec())
+        (contract_backward(at, v_contracted), v_code.to_vec())
     }
 }
 

@@ -91,9 +91,9 @@ pub fn look_up(shape: &GridShape, table: &[[f64; N_FEATURES]], at: [f64; 3]) -> 
     let mut found = Vec::with_capacity(shape.n_outputs());
     for level in 0..shape.n_cells.len() {
         let corners = corners(shape, level, at);
-        for feature in 0..N_FEATURES {
-            found.push(corners.iter().map(|corner| corner.weight * table[corner.entry][feature]).sum());
-        }
+        let sum =
+            |feature: usize| -> f64 { corners.iter().map(|corner| corner.weight * table[corner.entry][feature]).sum() };
+        found.extend((0..N_FEATURES).map(sum));
     }
     found
 }
@@ -112,8 +112,8 @@ pub fn look_up_backward(
             for feature in 0..N_FEATURES {
                 let v = upstream[level * N_FEATURES + feature];
                 v_table[corner.entry][feature] += corner.weight * v;
-                for axis in 0..3 {
-                    v_at[axis] += corner.slope[axis] * table[corner.entry][feature] * v;
+                for (sum, slope) in v_at.iter_mut().zip(corner.slope) {
+                    *sum += slope * table[corner.entry][feature] * v;
                 }
             }
         }

@@ -9,6 +9,7 @@
 
 pub mod field;
 pub mod grid;
+pub mod march;
 pub mod network;
 pub mod ray;
 pub mod space;

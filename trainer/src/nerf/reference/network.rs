@@ -1,4 +1,4 @@
-//! A small fully connected network without biases: hidden layers end at zero (ReLU), the last one does not.
+//! A small fully connected network without biases: hidden layers end at zero (`ReLU`), the last one does not.
 
 /// Weights of a network.
 #[derive(Clone, Debug, PartialEq)]

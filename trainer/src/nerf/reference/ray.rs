@@ -1,23 +1,24 @@
-//! Samples along a ray, what they add up to, and how far that is from what an image shows there.
+//! Samples along a ray, what they add up to, and how far that is from what an image shows there. Lengths are in units of the
+//! scene's radius.
 
 /// One sample of a ray.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sample {
-    /// Begin and end along the ray, metres.
-    pub span_m: [f64; 2],
-    /// Per metre.
+    /// Begin and end along the ray.
+    pub span: [f64; 2],
+    /// Per unit of length.
     pub density: f64,
     /// 0 to 1.
     pub rgb: [f64; 3],
 }
 
 impl Sample {
-    fn length_m(&self) -> f64 {
-        self.span_m[1] - self.span_m[0]
+    fn length(&self) -> f64 {
+        self.span[1] - self.span[0]
     }
 
-    fn middle_m(&self) -> f64 {
-        0.5 * (self.span_m[0] + self.span_m[1])
+    fn middle(&self) -> f64 {
+        0.5 * (self.span[0] + self.span[1])
     }
 }
 
@@ -28,22 +29,22 @@ pub struct Seen {
     pub rgb: [f64; 3],
     /// What is left of the light behind all samples.
     pub transmittance: f64,
-    /// Sum of the weights times the distance along the ray, metres.
-    pub distance_m: f64,
+    /// Sum of the weights times the distance along the ray.
+    pub distance: f64,
     /// Share of each sample in the picture.
     pub weights: Vec<f64>,
 }
 
 /// Adds up the samples of a ray, near ones first (Max 1995).
 pub fn composite(samples: &[Sample]) -> Seen {
-    let mut seen = Seen { rgb: [0.0; 3], transmittance: 1.0, distance_m: 0.0, weights: Vec::new() };
+    let mut seen = Seen { rgb: [0.0; 3], transmittance: 1.0, distance: 0.0, weights: Vec::new() };
     for sample in samples {
-        let left = (-sample.density * sample.length_m()).exp();
+        let left = (-sample.density * sample.length()).exp();
         let weight = seen.transmittance * (1.0 - left);
         for channel in 0..3 {
             seen.rgb[channel] += weight * sample.rgb[channel];
         }
-        seen.distance_m += weight * sample.middle_m();
+        seen.distance += weight * sample.middle();
         seen.transmittance *= left;
         seen.weights.push(weight);
     }
@@ -58,7 +59,7 @@ pub struct Upstream {
     /// Towards what is left of the light.
     pub transmittance: f64,
     /// Towards the distance.
-    pub distance_m: f64,
+    pub distance: f64,
     /// Towards each weight alone.
     pub weights: Vec<f64>,
 }
@@ -67,17 +68,17 @@ pub struct Upstream {
 pub fn composite_backward(samples: &[Sample], seen: &Seen, upstream: &Upstream) -> Vec<(f64, [f64; 3])> {
     let worth = |ix: usize| {
         let color: f64 = (0..3).map(|channel| upstream.rgb[channel] * samples[ix].rgb[channel]).sum();
-        color + upstream.distance_m * samples[ix].middle_m() + upstream.weights[ix]
+        color + upstream.distance * samples[ix].middle() + upstream.weights[ix]
     };
     // What lies behind a sample loses as much light as the sample takes.
     let mut behind = seen.transmittance * upstream.transmittance;
     let mut slopes = Vec::with_capacity(samples.len());
     for ix in (0..samples.len()).rev() {
         let transmittance_after: f64 = {
-            let upto: f64 = samples[..=ix].iter().map(|sample| sample.density * sample.length_m()).sum();
+            let upto: f64 = samples[..=ix].iter().map(|sample| sample.density * sample.length()).sum();
             (-upto).exp()
         };
-        let v_density = samples[ix].length_m() * (transmittance_after * worth(ix) - behind);
+        let v_density = samples[ix].length() * (transmittance_after * worth(ix) - behind);
         slopes.push((v_density, upstream.rgb.map(|v| v * seen.weights[ix])));
         behind += seen.weights[ix] * worth(ix);
     }
@@ -89,11 +90,11 @@ pub fn composite_backward(samples: &[Sample], seen: &Seen, upstream: &Upstream) 
 ///
 /// Distances count as `near / t`, so that spread far away costs less. Source: Barron et al. 2022, equation 15, summed in one
 /// pass as in Sun et al. 2022.
-pub fn distortion(samples: &[Sample], weights: &[f64], near_m: f64) -> (f64, Vec<f64>) {
-    let place = |t_m: f64| 1.0 - near_m / t_m.max(near_m);
+pub fn distortion(samples: &[Sample], weights: &[f64], near: f64) -> (f64, Vec<f64>) {
+    let place = |t: f64| 1.0 - near / t.max(near);
     let middles: Vec<f64> =
-        samples.iter().map(|sample| 0.5 * (place(sample.span_m[0]) + place(sample.span_m[1]))).collect();
-    let lengths: Vec<f64> = samples.iter().map(|sample| place(sample.span_m[1]) - place(sample.span_m[0])).collect();
+        samples.iter().map(|sample| 0.5 * (place(sample.span[0]) + place(sample.span[1]))).collect();
+    let lengths: Vec<f64> = samples.iter().map(|sample| place(sample.span[1]) - place(sample.span[0])).collect();
     let in_all: (f64, f64) = weights
         .iter()
         .zip(&middles)
@@ -115,32 +116,39 @@ pub fn distortion(samples: &[Sample], weights: &[f64], near_m: f64) -> (f64, Vec
 pub struct Target {
     /// 0 to 1.
     pub rgb: [f64; 3],
-    /// Distance along the ray, metres; 0 where unknown.
-    pub distance_m: f64,
+    /// Distance along the ray; 0 where unknown.
+    pub distance: f64,
 }
 
 /// How much each part of the loss counts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Weights {
-    /// Of the distance, per metre.
-    pub distance_per_m: f64,
-    /// Differences of distance beyond this pull no more, metres.
-    pub distance_clip_m: f64,
+    /// Of the distance, per unit.
+    pub distance_weight: f64,
+    /// Differences of distance beyond this pull no more.
+    pub distance_clip: f64,
     /// Of the spread.
     pub distortion: f64,
-    /// Where the places of the spread begin, metres.
-    pub near_m: f64,
+    /// Where the places of the spread begin.
+    pub near: f64,
+    /// Of light that is held back elsewhere than where the depth says.
+    pub sight: f64,
+    /// So close to a distance, per itself and at least, light may be held back.
+    pub band: [f64; 2],
     /// Color behind everything.
     pub background_rgb: [f64; 3],
 }
 
 /// Loss of one ray, and its slopes.
+///
+/// Where the distance is known, light should be held back there and nowhere else (line of sight: Rematas et al. 2022,
+/// equations 9 to 12, with a band in place of a bell); glass, which a depth camera looks through, may still hold back some.
 pub fn loss(samples: &[Sample], seen: &Seen, target: &Target, weights: &Weights) -> (f64, Upstream) {
-    let (spread, v_weights) = distortion(samples, &seen.weights, weights.near_m);
+    let (spread, v_weights) = distortion(samples, &seen.weights, weights.near);
     let mut upstream = Upstream {
         rgb: [0.0; 3],
         transmittance: 0.0,
-        distance_m: 0.0,
+        distance: 0.0,
         weights: v_weights.iter().map(|v| weights.distortion * v).collect(),
     };
     let mut loss = weights.distortion * spread;
@@ -151,13 +159,24 @@ pub fn loss(samples: &[Sample], seen: &Seen, target: &Target, weights: &Weights)
         upstream.rgb[channel] = 2.0 * miss / 3.0;
         upstream.transmittance += 2.0 * miss / 3.0 * background;
     }
-    let miss_m = seen.distance_m - (1.0 - seen.transmittance) * target.distance_m;
-    if target.distance_m > 0.0 {
-        loss += weights.distance_per_m * miss_m.abs().min(weights.distance_clip_m);
-        if miss_m.abs() < weights.distance_clip_m {
-            let v = weights.distance_per_m * miss_m.signum();
-            upstream.distance_m = v;
-            upstream.transmittance += v * target.distance_m;
+    if target.distance > 0.0 {
+        let reach = weights.band[0] * target.distance + weights.band[1];
+        let is_close = |sample: &Sample| (sample.middle() - target.distance).abs() <= reach;
+        let parts = || samples.iter().zip(&seen.weights);
+        let close: f64 = parts().filter(|(sample, _)| is_close(sample)).map(|(_, weight)| weight).sum();
+        let off: f64 = parts().filter(|(sample, _)| !is_close(sample)).map(|(_, weight)| weight * weight).sum();
+        loss += weights.sight * ((1.0 - close).powi(2) + off);
+        for ((sample, weight), v) in parts().zip(&mut upstream.weights) {
+            *v += 2.0 * weights.sight * if is_close(sample) { close - 1.0 } else { *weight };
+        }
+    }
+    let miss_far = seen.distance - (1.0 - seen.transmittance) * target.distance;
+    if target.distance > 0.0 {
+        loss += weights.distance_weight * miss_far.abs().min(weights.distance_clip);
+        if miss_far.abs() < weights.distance_clip {
+            let v = weights.distance_weight * miss_far.signum();
+            upstream.distance = v;
+            upstream.transmittance += v * target.distance;
         }
     }
     (loss, upstream)

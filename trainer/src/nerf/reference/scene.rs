@@ -4,7 +4,6 @@ use super::field::{Field, FieldGrad};
 use super::grid::GridShape;
 use super::network::Network;
 use super::ray::{self, Sample, Target, Weights};
-use super::space::Space;
 use crate::splat::reference::scene::Random;
 
 fn rounded(value: f64) -> f64 {
@@ -27,7 +26,6 @@ pub(crate) fn field(seed: u64) -> Field {
     let shape = shape();
     let [density, color] = Field::sizes(&shape, 7, N_CODE);
     Field {
-        space: Space { center_m: [0.125, -0.25, 0.375], radius_m: 1.25 },
         table: (0..shape.n_entries_in_all()).map(|_| random.array(-0.8, 0.8)).collect(),
         density: network(&mut random, density),
         color: network(&mut random, color),
@@ -37,9 +35,9 @@ pub(crate) fn field(seed: u64) -> Field {
 
 /// A ray with samples within the inner cube and outside of it, its image's code and target.
 pub(crate) struct Ray {
-    pub(crate) origin_m: [f64; 3],
+    pub(crate) origin: [f64; 3],
     pub(crate) direction: [f64; 3],
-    pub(crate) spans_m: Vec<[f64; 2]>,
+    pub(crate) spans: Vec<[f64; 2]>,
     pub(crate) code: Vec<f64>,
     pub(crate) target: Target,
 }
@@ -47,37 +45,39 @@ pub(crate) struct Ray {
 pub(crate) fn ray(seed: u64) -> Ray {
     let mut random = Random::new(seed);
     let direction = nalgebra::Vector3::from(random.array(-1.0, 1.0)).normalize().map(rounded);
-    let mut at_m = 0.2;
+    let mut walked = 0.2;
     let span = |_| {
-        let begin = rounded(at_m + random.uniform(0.02, 0.2));
-        at_m = rounded(begin + random.uniform(0.1, 0.6));
-        [begin, at_m]
+        let begin = rounded(walked + random.uniform(0.02, 0.2));
+        walked = rounded(begin + random.uniform(0.1, 0.6));
+        [begin, walked]
     };
-    let spans_m = (0..7).map(span).collect();
+    let spans = (0..7).map(span).collect();
     let code = random.array::<N_CODE>(-0.5, 0.5).to_vec();
     let target =
-        Target { rgb: random.array(0.1, 0.9).map(|value: f64| (255.0 * value).round() / 255.0), distance_m: 1.75 };
-    Ray { origin_m: random.array(-0.4, 0.4), direction: direction.into(), spans_m, code, target }
+        Target { rgb: random.array(0.1, 0.9).map(|value: f64| (255.0 * value).round() / 255.0), distance: 1.75 };
+    Ray { origin: random.array(-0.4, 0.4), direction: direction.into(), spans, code, target }
 }
 
 pub(crate) const WEIGHTS: Weights = Weights {
-    distance_per_m: 0.5,
-    distance_clip_m: 5.0,
+    distance_weight: 0.5,
+    distance_clip: 5.0,
     distortion: 0.25,
-    near_m: 0.125,
+    near: 0.125,
+    sight: 0.5,
+    band: [0.0625, 0.125],
     background_rgb: [0.25, 0.5, 0.75],
 };
 
-fn place(ray: &Ray, span_m: [f64; 2]) -> [f64; 3] {
-    std::array::from_fn(|axis| ray.origin_m[axis] + 0.5 * (span_m[0] + span_m[1]) * ray.direction[axis])
+fn place(ray: &Ray, span: [f64; 2]) -> [f64; 3] {
+    std::array::from_fn(|axis| ray.origin[axis] + 0.5 * (span[0] + span[1]) * ray.direction[axis])
 }
 
 pub(crate) fn samples(field: &Field, ray: &Ray) -> Vec<Sample> {
-    let sample = |span_m: &[f64; 2]| {
-        let point = field.point(place(ray, *span_m), ray.direction, &ray.code);
-        Sample { span_m: *span_m, density: point.density, rgb: point.rgb }
+    let sample = |span: &[f64; 2]| {
+        let point = field.point(place(ray, *span), ray.direction, &ray.code);
+        Sample { span: *span, density: point.density, rgb: point.rgb }
     };
-    ray.spans_m.iter().map(sample).collect()
+    ray.spans.iter().map(sample).collect()
 }
 
 pub(crate) fn loss(field: &Field, ray: &Ray) -> f64 {
@@ -92,12 +92,12 @@ pub(crate) fn gradient(field: &Field, ray: &Ray) -> (FieldGrad, [f64; 3], Vec<f6
     let (_, upstream) = ray::loss(&samples, &seen, &ray.target, &WEIGHTS);
     let slopes = ray::composite_backward(&samples, &seen, &upstream);
     let (mut gradient, mut v_origin, mut v_code) = (FieldGrad::zeros(field), [0.0; 3], vec![0.0; N_CODE]);
-    for (span_m, (v_density, v_rgb)) in ray.spans_m.iter().zip(slopes) {
-        let world_m = place(ray, *span_m);
-        let point = field.point(world_m, ray.direction, &ray.code);
-        let (v_world, v_own) = field.point_backward(world_m, &point, v_density, v_rgb, &mut gradient);
+    for (span, (v_density, v_rgb)) in ray.spans.iter().zip(slopes) {
+        let at = place(ray, *span);
+        let point = field.point(at, ray.direction, &ray.code);
+        let (v_at, v_own) = field.point_backward(at, &point, v_density, v_rgb, &mut gradient);
         for axis in 0..3 {
-            v_origin[axis] += v_world[axis];
+            v_origin[axis] += v_at[axis];
         }
         v_code.iter_mut().zip(v_own).for_each(|(sum, v)| *sum += v);
     }

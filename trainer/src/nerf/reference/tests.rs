@@ -4,7 +4,7 @@ use super::field::Field;
 use super::grid::{self, GridShape};
 use super::ray::{self, Sample};
 use super::scene::{N_CODE, Ray, field, gradient, loss, ray};
-use super::space::Space;
+use super::space::{contract, contract_backward};
 use crate::mismatches::Mismatches;
 
 const NUDGE: f64 = 1e-5;
@@ -26,9 +26,9 @@ fn gradients_of_a_ray_match_central_differences() {
             loss(&field, &ray)
         };
         for (ix, entry) in slopes.table.iter().enumerate() {
-            for feature in 0..2 {
+            for (feature, slope) in entry.iter().enumerate() {
                 let numeric = central(|step| nudged(&|field, step| field.table[ix][feature] += step, step));
-                wrong.check(format!("{seed}: entry {ix} {feature}"), entry[feature], numeric, ABS, REL);
+                wrong.check(format!("{seed}: entry {ix} {feature}"), *slope, numeric, ABS, REL);
             }
         }
         for (ix, slope) in slopes.density.iter().enumerate() {
@@ -41,9 +41,9 @@ fn gradients_of_a_ray_match_central_differences() {
         }
         for axis in 0..3 {
             let moved = |step: f64| {
-                let mut origin_m = ray.origin_m;
-                origin_m[axis] += step;
-                loss(&field, &Ray { origin_m, spans_m: ray.spans_m.clone(), code: ray.code.clone(), ..ray })
+                let mut origin = ray.origin;
+                origin[axis] += step;
+                loss(&field, &Ray { origin, spans: ray.spans.clone(), code: ray.code.clone(), ..ray })
             };
             wrong.check(format!("{seed}: origin {axis}"), v_origin[axis], central(moved), ABS, REL);
         }
@@ -51,7 +51,7 @@ fn gradients_of_a_ray_match_central_differences() {
             let moved = |step: f64| {
                 let mut code = ray.code.clone();
                 code[ix] += step;
-                loss(&field, &Ray { code, spans_m: ray.spans_m.clone(), ..ray })
+                loss(&field, &Ray { code, spans: ray.spans.clone(), ..ray })
             };
             wrong.check(format!("{seed}: code {ix}"), v_code[ix], central(moved), ABS, REL);
         }
@@ -61,22 +61,21 @@ fn gradients_of_a_ray_match_central_differences() {
 
 #[test]
 fn contraction_keeps_the_inside_and_draws_in_the_outside() {
-    let space = Space { center_m: [1.0, 2.0, 3.0], radius_m: 2.0 };
-    assert_eq!(space.contract([1.0, 2.0, 3.0]), [0.5; 3]);
-    assert_eq!(space.contract([3.0, 0.0, 3.0]), [0.75, 0.25, 0.5]);
-    let far = space.contract([1e9, 2.0, 3.0]);
+    assert_eq!(contract([0.0; 3]), [0.5; 3]);
+    assert_eq!(contract([1.0, -1.0, 0.0]), [0.75, 0.25, 0.5]);
+    let far = contract([1e9, 0.0, 0.0]);
     assert!(far[0] > 0.999_999 && far[0] < 1.0 && (far[1] - 0.5).abs() < 1e-9, "{far:?}");
     let mut wrong = Mismatches::default();
     let upstream = [0.7, -0.4, 0.9];
-    for world_m in [[1.3, 1.2, 3.9], [9.0, -3.0, 4.0], [-20.0, 30.0, -50.0], [2.0, 2.5, -7.0]] {
-        let slopes = space.contract_backward(world_m, upstream);
+    for at in [[0.15, -0.4, 0.45], [4.0, -2.5, 0.5], [-10.5, 14.0, -26.5], [0.5, 0.25, -5.0]] {
+        let slopes = contract_backward(at, upstream);
         for axis in 0..3 {
             let numeric = central(|step| {
-                let mut moved = world_m;
+                let mut moved = at;
                 moved[axis] += step;
-                space.contract(moved).iter().zip(upstream).map(|(x, v)| x * v).sum()
+                contract(moved).iter().zip(upstream).map(|(x, v)| x * v).sum()
             });
-            wrong.check(format!("{world_m:?} {axis}"), slopes[axis], numeric, 1e-9, 1e-6);
+            wrong.check(format!("{at:?} {axis}"), slopes[axis], numeric, 1e-9, 1e-6);
         }
     }
     wrong.assert_none();
@@ -115,34 +114,31 @@ fn levels_grow_evenly_and_large_ones_share_entries() {
 
 #[test]
 fn a_ray_adds_up_to_one_and_an_opaque_sample_hides_the_rest() {
-    let sample = |begin_m: f64, density: f64, red: f64| Sample {
-        span_m: [begin_m, begin_m + 0.5],
-        density,
-        rgb: [red, 0.0, 1.0],
-    };
+    let sample =
+        |begin: f64, density: f64, red: f64| Sample { span: [begin, begin + 0.5], density, rgb: [red, 0.0, 1.0] };
     let samples = [sample(1.0, 0.5, 0.2), sample(1.5, 1e3, 0.9), sample(2.0, 2.0, 0.1)];
     let seen = ray::composite(&samples);
     assert!((seen.weights.iter().sum::<f64>() + seen.transmittance - 1.0).abs() < 1e-12);
     let first = 1.0 - (-0.25f64).exp();
     assert!((seen.rgb[0] - (first * 0.2 + (1.0 - first) * 0.9)).abs() < 1e-9 && seen.weights[2] < 1e-9);
-    assert!((seen.distance_m - (first * 1.25 + (1.0 - first) * 1.75)).abs() < 1e-9);
+    assert!((seen.distance - (first * 1.25 + (1.0 - first) * 1.75)).abs() < 1e-9);
 }
 
 /// The sum over all pairs, as it is defined.
 #[test]
 fn distortion_in_one_pass_is_the_sum_over_pairs() {
     let samples: Vec<Sample> = [[1.0, 1.4], [1.5, 1.9], [1.9, 4.0], [6.0, 7.0]]
-        .map(|span_m| Sample { span_m, density: 1.0, rgb: [0.0; 3] })
+        .map(|span| Sample { span, density: 1.0, rgb: [0.0; 3] })
         .to_vec();
     let weights = [0.1, 0.4, 0.2, 0.15];
-    let place = |t_m: f64| 1.0 - 0.5 / t_m;
-    let middle = |ix: usize| 0.5 * (place(samples[ix].span_m[0]) + place(samples[ix].span_m[1]));
+    let place = |t: f64| 1.0 - 0.5 / t;
+    let middle = |ix: usize| 0.5 * (place(samples[ix].span[0]) + place(samples[ix].span[1]));
     let mut expected = 0.0;
     for i in 0..4 {
         for j in 0..4 {
             expected += weights[i] * weights[j] * (middle(i) - middle(j)).abs();
         }
-        expected += weights[i] * weights[i] * (place(samples[i].span_m[1]) - place(samples[i].span_m[0])) / 3.0;
+        expected += weights[i] * weights[i] * (place(samples[i].span[1]) - place(samples[i].span[0])) / 3.0;
     }
     assert!((ray::distortion(&samples, &weights, 0.5).0 - expected).abs() < 1e-12);
     let alone = ray::distortion(&samples, &[0.0, 1e-9, 0.0, 0.0], 0.5);

@@ -5,6 +5,7 @@ use super::aligning::Aligning;
 use crate::align::Alignment;
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::gpu::{Gpu, PendingRead};
+use crate::seen::{self, Seen};
 use crate::splat::buffers::{N_PLANED, SplatBuffers};
 use crate::splat::camera_terms::{CameraSlots, TermSet};
 use crate::splat::options::SplatOptions;
@@ -12,9 +13,8 @@ use crate::splat::params::status;
 use crate::splat::seed::Seeder;
 use crate::splat::trials::{Trial, Untried};
 use crate::splat::views::TrainView;
-use crate::{Error, Keyframe, Split};
+use crate::{Error, Keyframe};
 use serde::{Deserialize, Serialize};
-use std::collections::HashMap;
 use std::sync::Arc;
 
 const METHOD: &str = "splat";
@@ -55,54 +55,6 @@ struct State {
     /// Whether alignment is settled, and what it found; views are told as it corrected them.
     is_aligned: bool,
     alignment: Option<Alignment>,
-}
-
-/// What tells one keyframe from another without its pixels.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Seen {
-    camera: String,
-    stamp_nanos: i64,
-    size_px: [u32; 2],
-    depth_size_px: Option<[u32; 2]>,
-    focal_px: [f64; 2],
-    principal_px: [f64; 2],
-    /// Translation, then rotation as x, y, z, w.
-    world_from_camera: [f64; 7],
-}
-
-impl Seen {
-    fn of(keyframe: &Keyframe) -> Self {
-        let pose = &keyframe.world_from_camera;
-        let (place, turn) = (pose.translation.vector, pose.rotation.coords);
-        Self {
-            camera: keyframe.camera.to_string(),
-            stamp_nanos: keyframe.stamp.0,
-            size_px: keyframe.size_px,
-            depth_size_px: keyframe.depth.as_ref().map(|depth| depth.size_px),
-            focal_px: keyframe.focal_px,
-            principal_px: keyframe.principal_px,
-            world_from_camera: [place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w],
-        }
-    }
-
-    /// Why the keyframe is not the one that was seen; `None` where it is.
-    fn difference(&self, keyframe: &Keyframe) -> Option<String> {
-        let other = Self::of(keyframe);
-        let [[width, height], [other_width, other_height]] = [self.size_px, other.size_px];
-        let what = if self.size_px != other.size_px {
-            format!("has {other_width}x{other_height} pixels, had {width}x{height}")
-        } else if self.depth_size_px != other.depth_size_px {
-            "has another depth image".to_owned()
-        } else if (self.focal_px, self.principal_px) != (other.focal_px, other.principal_px) {
-            "has another lens".to_owned()
-        } else if self.world_from_camera != other.world_from_camera {
-            "has another pose".to_owned()
-        } else {
-            return None;
-        };
-        Some(format!("image {} of camera {:?} {what}", self.stamp_nanos, self.camera))
-    }
 }
 
 impl SplatTrainer {
@@ -186,7 +138,7 @@ impl SplatTrainer {
         } else {
             Aligning::new(&state.options.align)
         };
-        let (views, rest) = matched(&state, &aligning, keyframes)?;
+        let (views, rest) = seen::matched(&state.views, keyframes, |keyframe| aligning.corrected(keyframe))?;
         let n_splats = state.n_splats;
         if n_splats > state.capacity || state.active_degree > state.sh_degree || state.sh_degree > 3 {
             return Err(bad_state(format!("{n_splats} splats of degree {} do not fit", state.active_degree)));
@@ -227,34 +179,6 @@ impl SplatTrainer {
         trainer.n_poisoned = state.n_poisoned.into();
         Ok((trainer, rest))
     }
-}
-
-/// The keyframes of the views, in their order, and the others.
-type Matched = (Vec<Arc<Keyframe>>, Vec<Arc<Keyframe>>);
-
-fn matched(state: &State, aligning: &Aligning, keyframes: &[Arc<Keyframe>]) -> Result<Matched, Error> {
-    let by_name: HashMap<_, _> = keyframes
-        .iter()
-        .filter(|keyframe| keyframe.split != Split::Test)
-        .map(|keyframe| ((&*keyframe.camera, keyframe.stamp.0), keyframe))
-        .collect();
-    let mut views = Vec::new();
-    let mut as_given: Vec<&Arc<Keyframe>> = Vec::new();
-    for seen in &state.views {
-        let (camera, stamp) = (seen.camera.as_str(), seen.stamp_nanos);
-        let keyframe = by_name.get(&(camera, stamp)).ok_or_else(|| {
-            Error::CheckpointData(format!("image {stamp} of camera {camera:?} is not there to be learned from"))
-        })?;
-        let corrected = aligning.corrected(keyframe);
-        if let Some(difference) = seen.difference(&corrected) {
-            return Err(Error::CheckpointData(difference));
-        }
-        as_given.push(*keyframe);
-        views.push(corrected);
-    }
-    let is_view = |keyframe: &Arc<Keyframe>| as_given.iter().any(|view| Arc::ptr_eq(view, keyframe));
-    let rest = keyframes.iter().filter(|keyframe| !is_view(keyframe)).cloned().collect();
-    Ok((views, rest))
 }
 
 /// One buffer on its way to the host.

@@ -2,7 +2,7 @@
 
 use super::{Mesh, write_glb, write_ply};
 use crate::gpu::{Gpu, GpuOptions};
-use crate::tsdf::scenes::{self, Shape};
+use crate::test_scenes::{self as scenes, Shape};
 use crate::tsdf::{TsdfModel, TsdfOptions};
 use crate::{Keyframe, Method};
 use nalgebra::{Point3, Vector3};

@@ -7,29 +7,15 @@ use super::super::options::TsdfOptions;
 use super::{FIRST_CAPACITY, TsdfModel};
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::gpu::Gpu;
-use crate::{Error, Keyframe, Split};
+use crate::seen::{self, Seen};
+use crate::{Error, Keyframe};
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
 pub(super) const METHOD: &str = "tsdf";
 const PLACES: &str = "places";
 const GEOMETRY: &str = "geometry";
 const COLORS: &str = "colors";
-
-/// What tells one keyframe from another.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct Name {
-    camera: String,
-    stamp_nanos: i64,
-}
-
-impl Name {
-    pub(super) fn of(keyframe: &Keyframe) -> Self {
-        Self { camera: keyframe.camera.to_string(), stamp_nanos: keyframe.stamp.0 }
-    }
-}
 
 /// All but the blocks.
 #[derive(Debug, Serialize, Deserialize)]
@@ -40,9 +26,9 @@ pub(super) struct State {
     pub(super) step: u64,
     pub(super) n_refused: u64,
     pub(super) n_blocks: u64,
-    pub(super) fused: Vec<Name>,
+    pub(super) fused: Vec<Seen>,
     /// Pushed and not fused, in order.
-    pub(super) pending: Vec<Name>,
+    pub(super) pending: Vec<Seen>,
 }
 
 impl TsdfModel {
@@ -61,7 +47,7 @@ impl TsdfModel {
             n_refused: self.n_refused,
             n_blocks: blocks.len() as u64,
             fused: self.fused.clone(),
-            pending: self.pending.iter().map(|keyframe| Name::of(keyframe)).collect(),
+            pending: self.pending.iter().map(|keyframe| Seen::of(keyframe)).collect(),
         };
         let state = serde_json::to_value(state).map_err(|error| bad_state(error.to_string()))?;
         Ok((state, arrays_of(&blocks)))
@@ -75,27 +61,11 @@ impl TsdfModel {
         keyframes: &[Arc<Keyframe>],
     ) -> Result<(Self, Vec<Arc<Keyframe>>), Error> {
         let mut model = Self::of_state(gpu, checkpoint)?;
-        let mut rest: BTreeMap<Name, (usize, Arc<Keyframe>)> =
-            keyframes.iter().enumerate().map(|(ix, keyframe)| (Name::of(keyframe), (ix, keyframe.clone()))).collect();
-        let mut take = |name: &Name| {
-            rest.remove(name).map(|(_, keyframe)| keyframe).ok_or_else(|| {
-                let Name { camera, stamp_nanos } = name;
-                Error::CheckpointData(format!("image {stamp_nanos} of camera {camera:?} is not there"))
-            })
-        };
-        for name in &model.fused {
-            take(name)?;
-        }
-        let waiting: Result<VecDeque<_>, Error> = model.to_match.iter().map(&mut take).collect();
-        model.pending = waiting?;
+        let seen: Vec<Seen> = model.fused.iter().chain(&model.to_match).cloned().collect();
+        let (mut found, rest) = seen::matched(&seen, keyframes, Arc::clone)?;
+        model.pending = found.split_off(model.fused.len()).into();
         model.to_match.clear();
-        let mut rest: Vec<(usize, Arc<Keyframe>)> = rest.into_values().collect();
-        rest.sort_by_key(|(ix, _)| *ix);
-        debug_assert!(
-            model.pending.iter().all(|keyframe| keyframe.split != Split::Test),
-            "test images are never pushed"
-        );
-        Ok((model, rest.into_iter().map(|(_, keyframe)| keyframe).collect()))
+        Ok((model, rest))
     }
 
     /// The model a checkpoint holds, without the keyframes it waits for.

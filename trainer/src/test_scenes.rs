@@ -1,20 +1,20 @@
 //! Scenes of known shape, and exact keyframes of them.
 
-use super::TsdfOptions;
 use crate::gpu::f32_of;
+use crate::tsdf::TsdfOptions;
 use crate::{DepthMap, Keyframe, Projection, RenderRequest, Split};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 use std::f64::consts::PI;
 use std::sync::Arc;
 
-pub(super) const SIZE_PX: [u32; 2] = [96, 80];
-pub(super) const FOCAL_PX: [f64; 2] = [90.0, 88.0];
-pub(super) const PRINCIPAL_PX: [f64; 2] = [47.0, 41.5];
+pub(crate) const SIZE_PX: [u32; 2] = [96, 80];
+pub(crate) const FOCAL_PX: [f64; 2] = [90.0, 88.0];
+pub(crate) const PRINCIPAL_PX: [f64; 2] = [47.0, 41.5];
 
 /// A thing with a surface.
 #[derive(Clone, Copy, Debug)]
-pub(super) enum Shape {
+pub(crate) enum Shape {
     Sphere {
         center_m: Point3<f64>,
         radius_m: f64,
@@ -42,7 +42,7 @@ impl Shape {
     }
 
     /// Distance to the surface, outside positive for spheres; without sign for planes.
-    pub(super) fn distance_m(&self, point: &Point3<f64>) -> f64 {
+    pub(crate) fn distance_m(&self, point: &Point3<f64>) -> f64 {
         match self {
             Self::Sphere { center_m, radius_m } => (point - center_m).norm() - radius_m,
             Self::Plane { normal, offset_m } => (normal.dot(&point.coords) - offset_m).abs(),
@@ -51,18 +51,18 @@ impl Shape {
 }
 
 /// Color that the world has at a point.
-pub(super) fn color_srgb(point: &Point3<f64>) -> [f64; 3] {
+pub(crate) fn color_srgb(point: &Point3<f64>) -> [f64; 3] {
     [0, 1, 2].map(|axis| 0.5 + 0.4 * (3.0 * point[axis] + axis as f64).sin())
 }
 
 /// A camera at `eye` that looks at `target`, z up.
-pub(super) fn looking(eye: Point3<f64>, target: Point3<f64>) -> Transform {
+pub(crate) fn looking(eye: Point3<f64>, target: Point3<f64>) -> Transform {
     let up = if (target - eye).xy().norm() < 1e-9 { Vector3::y() } else { Vector3::z() };
     Transform::face_towards(&eye, &target, &up) * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), PI)
 }
 
 /// What a camera sees of the shapes: exact depth and color.
-pub(super) fn keyframe(ix: i64, shapes: &[Shape], world_from_camera: Transform) -> Keyframe {
+pub(crate) fn keyframe(ix: i64, shapes: &[Shape], world_from_camera: Transform) -> Keyframe {
     // The color camera sits 4 cm beside the depth camera and has another size.
     let color_pose = world_from_camera * Transform::translation(0.04, 0.0, 0.0);
     let depth_m: Vec<f32> = seen(shapes, &world_from_camera, SIZE_PX, FOCAL_PX, PRINCIPAL_PX)
@@ -100,7 +100,7 @@ pub(super) fn keyframe(ix: i64, shapes: &[Shape], world_from_camera: Transform) 
 }
 
 /// The same in the size of a depth camera's images.
-pub(super) fn large_keyframe(ix: i64, shapes: &[Shape], world_from_camera: Transform) -> Keyframe {
+pub(crate) fn large_keyframe(ix: i64, shapes: &[Shape], world_from_camera: Transform) -> Keyframe {
     let (size_px, focal_px, principal_px) = ([640, 480], [525.0; 2], [320.0, 240.0]);
     let mut keyframe = keyframe(ix, shapes, world_from_camera);
     let hits: Vec<_> = seen(shapes, &world_from_camera, size_px, focal_px, principal_px).collect();
@@ -140,17 +140,17 @@ fn seen(
 }
 
 /// A ball of 30 cm whose middle is `at`.
-pub(super) fn ball(at: Point3<f64>) -> Shape {
+pub(crate) fn ball(at: Point3<f64>) -> Shape {
     Shape::Sphere { center_m: at, radius_m: 0.3 }
 }
 
 /// The floor under it.
-pub(super) fn floor() -> Shape {
+pub(crate) fn floor() -> Shape {
     Shape::Plane { normal: Vector3::z(), offset_m: -0.3 }
 }
 
 /// Views of a point from all around, `n` of them, evenly over the sphere (Vogel 1979).
-pub(super) fn all_around(shapes: &[Shape], target: Point3<f64>, n: usize) -> Vec<Arc<Keyframe>> {
+pub(crate) fn all_around(shapes: &[Shape], target: Point3<f64>, n: usize) -> Vec<Arc<Keyframe>> {
     (0..n)
         .map(|ix| {
             let height = 1.0 - (2 * ix + 1) as f64 / n as f64;
@@ -162,7 +162,7 @@ pub(super) fn all_around(shapes: &[Shape], target: Point3<f64>, n: usize) -> Vec
 }
 
 /// Views from a part of a ring above the floor.
-pub(super) fn ring(shapes: &[Shape], target: Point3<f64>, n: usize) -> Vec<Arc<Keyframe>> {
+pub(crate) fn ring(shapes: &[Shape], target: Point3<f64>, n: usize) -> Vec<Arc<Keyframe>> {
     (0..n)
         .map(|ix| {
             let turn = 0.35 * ix as f64;
@@ -172,11 +172,11 @@ pub(super) fn ring(shapes: &[Shape], target: Point3<f64>, n: usize) -> Vec<Arc<K
         .collect()
 }
 
-pub(super) fn options() -> TsdfOptions {
+pub(crate) fn options() -> TsdfOptions {
     TsdfOptions { voxel_m: Some(0.02), noise_per_m2: Some(1e-4), ..TsdfOptions::default() }
 }
 
-pub(super) fn request(world_from_camera: Transform) -> RenderRequest {
+pub(crate) fn request(world_from_camera: Transform) -> RenderRequest {
     RenderRequest {
         world_from_camera,
         size_px: SIZE_PX,

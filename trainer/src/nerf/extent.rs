@@ -1,0 +1,134 @@
+//! Where the scene lies, as far as the keyframes tell.
+
+use crate::splat::Camera;
+use crate::{Aabb, Keyframe, Shutter};
+use kinematics::{Transform, Twist};
+use nalgebra::{Matrix3, Point3, Vector3};
+use serde::{Deserialize, Serialize};
+
+/// Readings of depth that are asked about the scene's size, of each keyframe.
+const READINGS_PER_KEYFRAME: usize = 64;
+/// Share of the readings on each side that may lie outside.
+const OUTSIDE_FRAC: f64 = 0.02;
+/// What is further away than this many times the median is far: it is drawn in.
+const FAR: f64 = 2.0;
+/// Where nothing is known, metres.
+const USUAL_RADIUS_M: f64 = 1.0;
+const LEAST_RADIUS_M: f64 = 0.01;
+/// Who reaches this many radii far calls for a new field: further out too little of the grid is left.
+const MOST_REACH: f64 = 2.0;
+
+/// The cube that is learned at full resolution; what lies outside is drawn in.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Extent {
+    /// Middle of the cube in world, metres.
+    pub center_m: [f64; 3],
+    /// Half an edge, metres.
+    pub radius_m: f64,
+}
+
+impl Extent {
+    /// Around the cameras and nearly all that they see.
+    ///
+    /// Without depth the middle is where the cameras look together, and the cameras are at its border.
+    pub fn of<'a>(keyframes: impl Iterator<Item = &'a Keyframe> + Clone) -> Self {
+        let cameras: Vec<Vector3<f64>> =
+            keyframes.clone().map(|keyframe| keyframe.world_from_camera.translation.vector).collect();
+        let mut seen: Vec<(f64, Vector3<f64>)> = keyframes.clone().flat_map(readings).collect();
+        if seen.is_empty() {
+            return Self::without_depth(keyframes, &cameras);
+        }
+        seen.sort_by(|(a, _), (b, _)| a.total_cmp(b));
+        let far_m = FAR * seen[seen.len() / 2].0;
+        seen.truncate(seen.partition_point(|(z_m, _)| *z_m <= far_m));
+        let range = |axis: usize| {
+            let mut along: Vec<f64> = seen.iter().map(|(_, point)| point[axis]).collect();
+            along.sort_by(f64::total_cmp);
+            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of a length")]
+            let cut = (along.len() as f64 * OUTSIDE_FRAC) as usize;
+            let ends = [along[cut], along[along.len() - 1 - cut]];
+            let of_cameras = cameras.iter().map(|camera| camera[axis]);
+            of_cameras.fold(ends, |ends, camera| [ends[0].min(camera), ends[1].max(camera)])
+        };
+        let ranges = [0, 1, 2].map(range);
+        let radius_m = ranges.iter().map(|[low, high]| 0.5 * (high - low)).fold(LEAST_RADIUS_M, f64::max);
+        Self { center_m: ranges.map(|[low, high]| 0.5 * (low + high)), radius_m }
+    }
+
+    fn without_depth<'a>(keyframes: impl Iterator<Item = &'a Keyframe>, cameras: &[Vector3<f64>]) -> Self {
+        // The point with the least sum of squared distances to the optical axes, held weakly at the cameras' mean.
+        const HOLD: f64 = 1e-3;
+        let mean = cameras.iter().sum::<Vector3<f64>>() / cameras.len().max(1) as f64;
+        let (mut normal, mut right) = (Matrix3::identity() * HOLD, mean * HOLD);
+        for keyframe in keyframes {
+            let axis = keyframe.world_from_camera.rotation * Vector3::z();
+            let across = Matrix3::identity() - axis * axis.transpose();
+            normal += across;
+            right += across * keyframe.world_from_camera.translation.vector;
+        }
+        let center = normal.try_inverse().map_or(mean, |inverse| inverse * right);
+        let furthest = cameras.iter().map(|camera| (camera - center).amax()).fold(0.0, f64::max);
+        let radius_m = if furthest > LEAST_RADIUS_M { furthest } else { USUAL_RADIUS_M };
+        Self { center_m: center.into(), radius_m }
+    }
+
+    /// Whether a field learned here says too little about a scene that lies there.
+    pub fn is_outgrown_by(&self, other: &Self) -> bool {
+        let off = Vector3::from(self.center_m) - Vector3::from(other.center_m);
+        off.amax() + other.radius_m > MOST_REACH * self.radius_m
+    }
+
+    /// A pose with its place in units of the radius around the middle.
+    pub(crate) fn in_units(&self, world_from_other: &Transform) -> Transform {
+        let mut pose = *world_from_other;
+        pose.translation.vector = (pose.translation.vector - Vector3::from(self.center_m)) / self.radius_m;
+        pose
+    }
+
+    /// A camera with all its lengths in units of the radius.
+    pub(crate) fn camera_in_units(&self, camera: &Camera) -> Camera {
+        let shutter = camera.shutter.map(|shutter| Shutter {
+            twist: Twist { linear_m_s: shutter.twist.linear_m_s / self.radius_m, ..shutter.twist },
+            ..shutter
+        });
+        let crop = camera.crop.map(|crop| Aabb {
+            world_from_box: self.in_units(&crop.world_from_box),
+            min_m: crop.min_m.map(|along| along / self.radius_m),
+            max_m: crop.max_m.map(|along| along / self.radius_m),
+        });
+        Camera {
+            world_from_camera: self.in_units(&camera.world_from_camera),
+            near_m: camera.near_m / self.radius_m,
+            far_m: camera.far_m / self.radius_m,
+            shutter,
+            crop,
+            ..camera.clone()
+        }
+    }
+}
+
+/// Some of what a keyframe's depth shows: how deep, and where in world.
+fn readings(keyframe: &Keyframe) -> Vec<(f64, Vector3<f64>)> {
+    let Some(depth) = &keyframe.depth else { return Vec::new() };
+    let width = depth.size_px[0].max(1);
+    // Some of each column and row.
+    let step = (depth.depth_m.len() / READINGS_PER_KEYFRAME).max(1) | 1;
+    let believed = (0u32..).zip(depth.depth_m.iter()).step_by(step).filter(|(_, z)| **z > 0.0 && z.is_finite());
+    let point = |(ix, z): (u32, &f32)| {
+        let in_camera = depth.point(ix % width, ix / width, f64::from(*z));
+        (f64::from(*z), (depth.world_from_camera * Point3::from(in_camera)).coords)
+    };
+    believed.map(point).collect()
+}
+
+/// The size that a pixel has in the scene, metres: median over the keyframes.
+pub(crate) fn pixel_size_m<'a>(keyframes: impl Iterator<Item = &'a Keyframe>, extent: &Extent) -> f64 {
+    let size = |keyframe: &Keyframe| {
+        let looks = crate::splat::median_depth_m(keyframe).unwrap_or(extent.radius_m);
+        looks / keyframe.focal_px[0].max(1.0)
+    };
+    let mut sizes: Vec<f64> = keyframes.map(size).collect();
+    sizes.sort_by(f64::total_cmp);
+    sizes.get(sizes.len() / 2).copied().unwrap_or(extent.radius_m / 512.0)
+}

@@ -1,0 +1,40 @@
+// hint_cells: what a depth image tells about cells of the occupancy that no sample was taken in yet.
+//
+// threads   one per hint
+// reads     hints [n]: cells; in the highest two bits what is told of them, see below
+// writes    thickness
+//
+// What is told is listed in the order of its weight, each kind in a dispatch of its own: a cell may be told more than once.
+
+#import folded
+
+@group(0) @binding(0) var<storage, read> hints: array<u32>;
+@group(0) @binding(1) var<storage, read_write> thickness: array<f32>;
+
+override KIND: u32;
+
+const LOOKED_AT_WITHOUT_END = 0u; // Something may be there, too far or too dark for the depth camera.
+const LOOKED_THROUGH = 1u;
+const SURFACE = 2u;
+
+// Of a cell that no image looks at, of one that was looked through, and of one that is to be walked until it was visited.
+const UNSEEN = 0.0;
+const EMPTY = 1e-30;
+const UNVISITED = -1.0;
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let ix = folded(wg, n_wgs) * 64u + lane;
+    if ix >= arrayLength(&hints) { return; }
+    let hint = hints[ix];
+    if hint >> 30u != KIND { return; }
+    let cell = hint & 0x3fffffffu;
+    let known = thickness[cell];
+    if KIND == SURFACE {
+        thickness[cell] = max(known, 1.0);
+    } else if KIND == LOOKED_THROUGH {
+        if known <= 0.0 { thickness[cell] = EMPTY; }
+    } else if known == UNSEEN {
+        thickness[cell] = UNVISITED;
+    }
+}

@@ -1,0 +1,294 @@
+//! A field on the GPU that learns from rays and draws pictures.
+
+use super::buffers::{BatchBuffers, FieldBuffers, FieldMoments, FieldSlopes, Occupancy, RaySlot};
+use super::kernels::{FieldPipelines, Widths};
+use super::options::{Effort, NerfOptions};
+use super::params::{Backdrop, Batch, LearnRule, March, Ray, RayLoss, Visit};
+use super::passes::{Canvas, FieldPasses};
+use super::rays::{mixed, unit};
+use super::reference::march as reference;
+use super::sizes::Sizes;
+use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
+use crate::splat::Camera;
+use crate::{Error, Picture};
+
+/// Most steps of a submit: their rays lie on the GPU at once.
+pub(crate) const STEPS_PER_SUBMIT: usize = 8;
+/// Steps between two visits of the occupancy.
+const VISIT_PERIOD: u64 = 16;
+/// Depth tells where something is until the field knows better: the first visit's step.
+const FIRST_VISIT_WITH_DEPTH: u64 = 128;
+/// What stays of a cell's thickness when it is visited.
+const KEPT_FRAC: f32 = 0.7;
+/// Share of the cells that a visit looks at, as far as a batch holds them.
+const VISITED_FRAC: f64 = 0.25;
+/// Most samples of a ray that is learned from, in even shares of the batch.
+const MOST_SHARES: u32 = 4;
+/// Samples that a ray of a picture takes at once.
+const SAMPLES_OF_ROUND: u32 = 8;
+/// Rounds before it is asked whether any ray goes on, and how often it is asked: rays are no longer than that.
+const ROUNDS_PER_SUBMIT: u32 = 2;
+const MOST_ROUNDS: u32 = 128;
+/// Range of the entries at the start (Mueller et al. 2022, section 4).
+const FIRST_ENTRY: f64 = 1e-4;
+/// Differences of distance beyond this pull no more, in units of the radius.
+const DISTANCE_CLIP: f32 = 0.5;
+/// Share of a distance by which a depth camera may be off.
+const BAND_FRAC: f32 = 0.01;
+/// Where the places of the spread begin, in units of the radius.
+const SPREAD_NEAR: f32 = 0.05;
+/// Scale of slopes at the start, before their sizes are known.
+const FIRST_SCALE: f32 = 1_048_576.0;
+
+/// All that one field takes on the GPU.
+#[derive(Debug)]
+pub(crate) struct Learner {
+    pub(crate) sizes: Sizes,
+    pub(crate) field: FieldBuffers,
+    pub(crate) moments: FieldMoments,
+    pub(crate) slopes: FieldSlopes,
+    pub(crate) occupancy: Occupancy,
+    pipelines: FieldPipelines,
+    batch: BatchBuffers,
+    slots: Vec<RaySlot>,
+    rules: [Buffer; 2],
+    picture: Option<(RaySlot, Canvas)>,
+    passes: Passes,
+}
+
+impl Learner {
+    /// A field that knows nothing.
+    pub(crate) fn new(gpu: &Gpu, options: &NerfOptions, sizes: Sizes) -> Result<Self, Error> {
+        let Effort { n_rays, n_samples, n_hidden, n_cells, n_steps, .. } = sizes.effort;
+        let shape = sizes.shape();
+        let n_levels = u32::try_from(shape.n_cells.len()).expect("a few levels");
+        let widths = Widths::new(n_levels, n_hidden, 0);
+        let field = FieldBuffers::new(gpu, &shape, &widths, sizes.n_codes)?;
+        let slopes = FieldSlopes::new(gpu, &shape, &widths)?;
+        gpu.write(&slopes.scales, 0, bytemuck::cast_slice(&vec![FIRST_SCALE; shape.n_cells.len()]));
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of a u32")]
+        let n_points = (f64::from(n_cells.pow(3)) * VISITED_FRAC) as u32;
+        let visit =
+            Visit { n_cells, n_points: n_points.min(n_samples), kept_frac: KEPT_FRAC, step: 2.0 / n_steps as f32 };
+        let learner = Self {
+            pipelines: FieldPipelines::new(gpu, &widths, n_samples, sizes.n_codes - 1)?,
+            moments: FieldMoments::new(gpu, &shape, &widths, &rule(options, 0.0))?,
+            occupancy: Occupancy::new(gpu, &visit, sizes.has_depth)?,
+            batch: BatchBuffers::new(gpu, &widths, n_rays, n_samples)?,
+            slots: Vec::new(),
+            rules: [
+                gpu.uniform_with("nerf.grid_rule", &rule(options, 0.0)),
+                gpu.uniform_with("nerf.weight_rule", &rule(options, 1e-6)),
+            ],
+            picture: None,
+            passes: Passes::default(),
+            field,
+            slopes,
+            sizes,
+        };
+        learner.fill(gpu, options.seed, &widths);
+        Ok(learner)
+    }
+
+    /// Random numbers to start from: small ones for entries, for weights as many as keep sums as large as their parts (Glorot
+    /// and Bengio 2010).
+    fn fill(&self, gpu: &Gpu, seed: u64, widths: &Widths) {
+        let uniform = |stream: u64, ix: usize, most: f64| {
+            f32_of(most * (2.0 * unit(mixed(seed ^ mixed(stream << 40 | ix as u64))) - 1.0))
+        };
+        let entries: Vec<f32> = (0..2 * self.field.n_entries as usize).map(|ix| uniform(1, ix, FIRST_ENTRY)).collect();
+        gpu.write(&self.field.grid, 0, bytemuck::cast_slice(&entries));
+        let networks = [(&self.field.density, &widths.density, 2), (&self.field.color, &widths.color, 10)];
+        for (weights, widths, stream) in networks {
+            for (ix, pair) in widths.windows(2).enumerate() {
+                let most = (6.0 / f64::from(pair[0] + pair[1])).sqrt();
+                let n = (pair[0] * pair[1]) as usize;
+                let layer: Vec<f32> = (0..n).map(|at| uniform(stream + ix as u64, at, most)).collect();
+                gpu.write(&weights[ix], 0, bytemuck::cast_slice(&layer));
+            }
+        }
+    }
+
+    /// Bytes of what is learned, its slopes and moments.
+    pub(crate) fn bytes(&self) -> u64 {
+        let all = |buffers: &[Buffer]| buffers.iter().map(Buffer::bytes).sum::<u64>();
+        let Self { field, slopes, moments, occupancy, .. } = self;
+        let weights = [&field.density, &field.color, &slopes.density, &slopes.color, &moments.density, &moments.color];
+        let grids = [&field.grid, &slopes.grid, &moments.grid, &occupancy.thickness, &occupancy.occupied];
+        weights.into_iter().map(|buffers| all(buffers)).sum::<u64>() + grids.into_iter().map(Buffer::bytes).sum::<u64>()
+    }
+
+    /// Lists one step that learns from some rays, as the `slot_ix`-th of a submit.
+    pub(crate) fn record_step(
+        &mut self,
+        gpu: &Gpu,
+        options: &NerfOptions,
+        slot_ix: usize,
+        step: u64,
+        rays: &[Ray],
+    ) -> Result<(), Error> {
+        let Effort { n_rays, n_samples, .. } = self.sizes.effort;
+        self.make_slot(gpu, slot_ix)?;
+        let slot = &self.slots[slot_ix];
+        gpu.write(&slot.rays, 0, bytemuck::cast_slice(rays));
+        let share = n_samples / n_rays * MOST_SHARES;
+        gpu.write(
+            &slot.march,
+            0,
+            bytemuck::bytes_of(&March { most_samples: share.max(1), ..march_of(self.sizes.effort) }),
+        );
+        // Whatever is behind the scene must not help to explain it.
+        let channel = |ix: u64| f32_of(unit(mixed(options.seed ^ mixed(step << 2 | ix))));
+        let loss = RayLoss {
+            background_srgb: [channel(0), channel(1), channel(2), 0.0],
+            distance_weight: f32_of(options.distance_weight),
+            distance_clip: DISTANCE_CLIP,
+            distortion: f32_of(options.distortion),
+            near: SPREAD_NEAR,
+            sight: f32_of(options.sight),
+            band: 2.0 * march_of(self.sizes.effort).step,
+            band_frac: BAND_FRAC,
+            unused: 0.0,
+        };
+        gpu.write(&slot.loss, 0, bytemuck::bytes_of(&loss));
+        let n_rays = u32::try_from(rays.len()).expect("at most the rays of a step");
+        // All steps of a submit have as many rays.
+        gpu.write(&self.batch.batch, 0, bytemuck::bytes_of(&Batch::of(n_rays)));
+        let Self { pipelines, field, batch, occupancy, moments, slopes, passes: list, .. } = self;
+        let passes = FieldPasses { gpu, pipelines, field, batch, slot };
+        let first_visit = if self.sizes.has_depth { FIRST_VISIT_WITH_DEPTH } else { VISIT_PERIOD };
+        if step.is_multiple_of(VISIT_PERIOD) && step >= first_visit {
+            passes.visit(list, occupancy, moments);
+        }
+        passes.count(list, occupancy);
+        passes.place(list, occupancy);
+        passes.forward(list);
+        passes.backward(list, slopes);
+        passes.learn(list, [&self.rules[0], &self.rules[1]], slopes, moments);
+        Ok(())
+    }
+
+    /// Sends what is listed; the read tells when it is done.
+    pub(crate) fn submit(&mut self, gpu: &Gpu) -> PendingRead {
+        self.passes.submit(gpu);
+        gpu.begin_read(&self.batch.batch, 2)
+    }
+
+    /// Sends what is listed with a timestamp around each pass.
+    pub(crate) fn submit_timed(&mut self, gpu: &Gpu) -> Result<Vec<PassTiming>, Error> {
+        self.passes.submit_timed(gpu)
+    }
+
+    /// How its rays are walked.
+    pub(crate) fn march(&self) -> reference::March {
+        let Effort { n_cells, n_steps, .. } = self.sizes.effort;
+        reference::March { step: 2.0 / f64::from(n_steps), most_samples: usize::MAX, n_cells: n_cells as usize }
+    }
+
+    /// Takes note of what a depth image tells about where something is.
+    pub(crate) fn hint(&mut self, gpu: &Gpu, hints: &[u32]) -> Result<(), Error> {
+        if hints.is_empty() {
+            return Ok(());
+        }
+        let buffer = gpu.storage_with("nerf.hints", bytemuck::cast_slice(&padded(hints)))?;
+        self.make_slot(gpu, 0)?;
+        let Self { pipelines, field, batch, occupancy, moments, slots, passes: list, .. } = self;
+        FieldPasses { gpu, pipelines, field, batch, slot: &slots[0] }.hint(list, occupancy, moments, &buffer);
+        list.submit(gpu);
+        list.forget_bindings(); // The hints are used once.
+        Ok(())
+    }
+
+    fn make_slot(&mut self, gpu: &Gpu, slot_ix: usize) -> Result<(), Error> {
+        if self.slots.len() <= slot_ix {
+            self.slots.push(RaySlot::new(gpu, self.sizes.effort.n_rays)?);
+        }
+        Ok(())
+    }
+
+    /// Draws a pinhole view, given in units of the scene's radius.
+    ///
+    /// Rays are followed in rounds of a few samples, until none lets light through or meets anything more.
+    pub(crate) fn draw(
+        &mut self,
+        gpu: &Gpu,
+        camera: &Camera,
+        background_srgb: [f32; 3],
+        radius_m: f64,
+    ) -> Result<Picture, Error> {
+        let n_pixels = camera.size_px[0] as usize * camera.size_px[1] as usize;
+        self.make_canvas(gpu, n_pixels as u64)?;
+        let Some((slot, canvas)) = &self.picture else { return Err(Error::DeviceLost) };
+        gpu.write(&canvas.view, 0, bytemuck::bytes_of(&camera.view()));
+        let backdrop = Backdrop { srgb: background_srgb, radius_m: f32_of(radius_m) };
+        gpu.write(&canvas.backdrop, 0, bytemuck::bytes_of(&backdrop));
+        let Self { pipelines, field, batch, occupancy, passes: list, sizes, .. } = self;
+        let of_pixels = FieldPasses { gpu, pipelines, field, batch, slot };
+        for first in (0..n_pixels).step_by(slot.n_rays as usize) {
+            let n = (n_pixels - first).min(slot.n_rays as usize);
+            let [first_ray, n_rays] = [first, n].map(|ix| u32::try_from(ix).expect("an image's pixels"));
+            let found = SAMPLES_OF_ROUND;
+            let march = March { first_ray, most_samples: found, most_found: found, ..march_of(sizes.effort) };
+            gpu.write(&slot.march, 0, bytemuck::bytes_of(&march));
+            gpu.write(&batch.batch, 0, bytemuck::bytes_of(&Batch::of(n_rays)));
+            of_pixels.picture_rays(list, canvas);
+            for _ in 0..MOST_ROUNDS {
+                for _ in 0..ROUNDS_PER_SUBMIT {
+                    of_pixels.count(list, occupancy);
+                    of_pixels.place(list, occupancy);
+                    of_pixels.forward(list);
+                    of_pixels.show(list, canvas);
+                }
+                list.submit(gpu);
+                let n_samples = gpu.read::<u32>(&batch.batch, 2)?[1];
+                log::debug!("nerf: pixel {first}: {n_samples} samples in the last round");
+                if n_samples == 0 {
+                    break;
+                }
+            }
+        }
+        let pixels: Vec<u32> = gpu.read(&canvas.pixels, n_pixels)?;
+        let depth_m = gpu.read(&canvas.depths, n_pixels)?;
+        Ok(Picture { size_px: camera.size_px, rgba_srgb: bytemuck::cast_slice(&pixels).to_vec(), depth_m })
+    }
+
+    fn make_canvas(&mut self, gpu: &Gpu, n_pixels: u64) -> Result<(), Error> {
+        if self.picture.as_ref().is_none_or(|(_, canvas)| canvas.n_pixels < n_pixels) {
+            self.passes.forget_bindings();
+            self.picture = None;
+            let n_rays = self.sizes.effort.n_samples / SAMPLES_OF_ROUND;
+            self.picture = Some((RaySlot::new(gpu, n_rays)?, Canvas::new(gpu, n_pixels, n_rays)?));
+        }
+        Ok(())
+    }
+}
+
+/// Whole sixteens of bytes, as buffers are; the last hint is given more than once.
+fn padded(hints: &[u32]) -> Vec<u32> {
+    let n = hints.len().next_multiple_of(4);
+    hints.iter().chain(std::iter::repeat_n(&hints[hints.len() - 1], n - hints.len())).copied().collect()
+}
+
+fn march_of(effort: Effort) -> March {
+    March {
+        step: 2.0 / effort.n_steps as f32,
+        most_samples: 1,
+        n_cells: effort.n_cells,
+        first_ray: 0,
+        most_found: u32::MAX,
+        explore_key: 0,
+        unused: [0; 2],
+    }
+}
+
+fn rule(options: &NerfOptions, pull: f32) -> LearnRule {
+    LearnRule {
+        rate: f32_of(options.rate),
+        final_rate_frac: f32_of(options.final_rate_frac),
+        betas: [0.9, 0.99],
+        epsilon: 1e-15,
+        pull,
+        n_planned_steps: options.n_planned_steps as f32,
+        unused: 0.0,
+    }
+}

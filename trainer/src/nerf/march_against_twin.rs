@@ -1,0 +1,114 @@
+//! Samples along rays against their twin.
+
+use super::buffers::{BatchBuffers, FieldBuffers, Occupancy, RaySlot};
+use super::kernels::{FieldPipelines, Widths};
+use super::params::{self, Batch, Span, Visit};
+use super::passes::FieldPasses;
+use super::reference::grid::GridShape;
+use super::reference::march::March;
+use super::reference::space::contract;
+use crate::gpu::{Gpu, GpuOptions, Passes, f32_of, f32s_of};
+use crate::mismatches::Mismatches;
+use crate::splat::reference::scene::Random;
+
+const N_CELLS: u32 = 16;
+/// More than a workgroup scans at once.
+const N_RAYS: u32 = 300;
+const CAPACITY: u32 = 16_384;
+const MARCH: March = March { step: 0.0625, most_samples: 12, n_cells: N_CELLS as usize };
+/// A place so close to a cell's side, in cells, may be taken for the next one in f32.
+const CLEAR: f64 = 1e-4;
+
+fn is_occupied(cell: usize) -> bool {
+    cell.wrapping_mul(2_654_435_761) >> 7 & 1 == 1
+}
+
+/// A ray, where it begins and ends, and its shift: numbers that f32 holds exactly.
+type TestRay = ([f64; 3], [f64; 3], [f64; 2], f64);
+
+fn rays() -> Vec<TestRay> {
+    let rounded = |x: f64| f64::from(f32_of(x));
+    let ray = |seed: u64| {
+        let mut random = Random::new(seed);
+        let direction = nalgebra::Vector3::from(random.array::<3>(-1.0, 1.0)).normalize().map(rounded);
+        // Some begin outside the inner cube, some end inside of it.
+        let end = if seed.is_multiple_of(5) { 1.5 } else { 1000.0 };
+        (random.array(-2.0, 2.0), direction.into(), [0.125, end], rounded(random.uniform(0.0, 0.99)))
+    };
+    (0..u64::from(N_RAYS)).map(ray).collect()
+}
+
+#[test]
+fn samples_lie_where_something_is_no_more_than_wanted() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let shape = GridShape::between(2, 4, 2, 6);
+    let widths = Widths::new(2, 4, 0);
+    let pipelines = FieldPipelines::new(&gpu, &widths, CAPACITY, 0).unwrap();
+    let field = FieldBuffers::new(&gpu, &shape, &widths, 1).unwrap();
+    let batch = BatchBuffers::new(&gpu, &widths, N_RAYS, CAPACITY).unwrap();
+    let occupancy =
+        Occupancy::new(&gpu, &Visit { n_cells: N_CELLS, n_points: 1, kept_frac: 1.0, step: 0.1 }, false).unwrap();
+    let bits = |word: usize| (0..32).fold(0u32, |bits, bit| bits | u32::from(is_occupied(32 * word + bit)) << bit);
+    let words: Vec<u32> = (0..N_CELLS.pow(3) as usize / 32).map(bits).collect();
+    gpu.write(&occupancy.occupied, 0, bytemuck::cast_slice(&words));
+    let slot = RaySlot::new(&gpu, N_RAYS).unwrap();
+    let rays = rays();
+    let gpu_ray = |(origin, direction, range, shift): &TestRay| params::Ray {
+        origin: f32s_of(*origin),
+        direction: f32s_of(*direction),
+        begin: f32_of(range[0]),
+        end: f32_of(range[1]),
+        shift: f32_of(*shift),
+        ..params::Ray::default()
+    };
+    let gpu_rays: Vec<params::Ray> = rays.iter().map(gpu_ray).collect();
+    gpu.write(&slot.rays, 0, bytemuck::cast_slice(&gpu_rays));
+    gpu.write(&batch.batch, 0, bytemuck::bytes_of(&Batch::of(N_RAYS)));
+    let march = params::March {
+        step: f32_of(MARCH.step),
+        most_samples: u32::try_from(MARCH.most_samples).unwrap(),
+        n_cells: N_CELLS,
+        first_ray: 0,
+        most_found: u32::MAX,
+        explore_key: 0,
+        unused: [0; 2],
+    };
+    gpu.write(&slot.march, 0, bytemuck::bytes_of(&march));
+    let passes = FieldPasses { gpu: &gpu, pipelines: &pipelines, field: &field, batch: &batch, slot: &slot };
+    let mut list = Passes::default();
+    passes.count(&mut list, &occupancy);
+    passes.place(&mut list, &occupancy);
+    list.submit(&gpu);
+
+    let [_, n_samples] = gpu.read::<u32>(&batch.batch, 2).unwrap()[..] else { panic!("two words") };
+    let placed: Vec<params::Ray> = gpu.read(&slot.rays, N_RAYS as usize).unwrap();
+    let spans: Vec<Span> = gpu.read(&batch.spans, n_samples as usize).unwrap();
+    let points: Vec<[f32; 4]> = gpu.read(&batch.points, n_samples as usize).unwrap();
+    assert_eq!(placed.iter().map(|ray| ray.n_samples).sum::<u32>(), n_samples);
+    let (mut wrong, mut n_compared, mut n_thinned) = (Mismatches::default(), 0, 0);
+    for (ix, (ray, (origin, direction, range, shift))) in placed.iter().zip(&rays).enumerate() {
+        let (pieces, margin) = MARCH.pieces((*origin, *direction), *range, *shift, is_occupied);
+        assert!(ray.n_samples as usize <= MARCH.most_samples, "ray {ix}: {}", ray.n_samples);
+        if margin < CLEAR {
+            continue;
+        }
+        n_compared += 1;
+        n_thinned += usize::from(pieces.len() > MARCH.most_samples);
+        let expected = MARCH.spans(&pieces, *shift);
+        assert_eq!(ray.n_samples as usize, expected.len(), "ray {ix} of {} pieces", pieces.len());
+        let begin = ray.first_sample as usize;
+        for (sample, [low, high]) in expected.into_iter().enumerate() {
+            let (span, point) = (spans[begin + sample], points[begin + sample]);
+            assert_eq!(span.ray as usize, ix);
+            wrong.check(format!("begin {ix} {sample}"), span.begin.into(), low, 1e-4, 1e-4);
+            wrong.check(format!("end {ix} {sample}"), span.end.into(), high, 1e-4, 1e-4);
+            let middle = 0.5 * (low + high);
+            let at = contract(std::array::from_fn(|axis| origin[axis] + middle * direction[axis]));
+            for axis in 0..3 {
+                wrong.check(format!("point {ix} {sample} {axis}"), point[axis].into(), at[axis], 1e-4, 0.0);
+            }
+        }
+    }
+    wrong.assert_none();
+    assert!(n_compared > 100 && n_thinned > 20, "only {n_compared} rays are clear, {n_thinned} of them thinned");
+}

@@ -1,0 +1,277 @@
+//! The neural field as a [`Method`].
+
+mod checkpoint;
+
+use super::carve;
+use super::extent::Extent;
+use super::learner::{Learner, STEPS_PER_SUBMIT};
+use super::options::{Effort, NerfOptions};
+use super::rays::{self, Draw, RayImage};
+use super::sizes::Sizes;
+use crate::align::Alignment;
+use crate::checkpoint::PendingCheckpoint;
+use crate::gpu::{Gpu, PassTiming, PendingRead};
+use crate::splat::{Camera, PosedLens, equirect};
+use crate::{Error, Keyframe, Method, Part, Picture, Progress, Projection, RenderRequest, Split};
+use kinematics::Stamp;
+use rayon::prelude::*;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// GPU time that a submit may take, milliseconds.
+const MOST_SUBMIT_MILLIS: f64 = 20.0;
+/// Nearest place that rays look at, in units of the scene's radius.
+const BEGIN: f32 = 0.03;
+
+/// A neural field that learns from keyframes: a hash grid and two small networks, drawn along rays.
+#[derive(Debug)]
+pub struct NerfModel {
+    gpu: Arc<Gpu>,
+    options: NerfOptions,
+    images: Vec<RayImage>,
+    field: Option<(Extent, Learner)>,
+    /// Keyframes came or went since the extent was looked at.
+    is_extent_due: bool,
+    /// Images whose depth was told to the field: the first so many.
+    n_hinted: usize,
+    in_flight: Option<InFlight>,
+    step: u64,
+    step_millis: f64,
+}
+
+#[derive(Debug)]
+struct InFlight {
+    batch: PendingRead,
+    n_steps: u64,
+    since: Instant,
+}
+
+impl NerfModel {
+    /// A model that has seen nothing.
+    pub fn new(gpu: Arc<Gpu>, options: NerfOptions) -> Result<Self, Error> {
+        let images = Vec::new();
+        Ok(Self {
+            gpu,
+            options,
+            images,
+            field: None,
+            is_extent_due: false,
+            n_hinted: 0,
+            in_flight: None,
+            step: 0,
+            step_millis: 0.0,
+        })
+    }
+
+    /// How it was asked to learn.
+    pub fn options(&self) -> &NerfOptions {
+        &self.options
+    }
+
+    /// Where the scene lies; `None` before the first keyframe is learned from.
+    pub fn extent(&self) -> Option<&Extent> {
+        self.field.as_ref().map(|(extent, _)| extent)
+    }
+
+    fn effort(&self) -> Effort {
+        self.options.effort.unwrap_or(if self.gpu.is_software() { Effort::SMALL } else { Effort::FULL })
+    }
+
+    /// Makes a field where there is none, or where the scene has outgrown it. False where there is nothing to learn from.
+    fn begin(&mut self) -> Result<bool, Error> {
+        if self.images.is_empty() {
+            return Ok(false);
+        }
+        if !std::mem::take(&mut self.is_extent_due) && self.field.is_some() {
+            return Ok(true);
+        }
+        self.fit_extent()?;
+        self.hint()?;
+        Ok(true)
+    }
+
+    fn fit_extent(&mut self) -> Result<(), Error> {
+        let keyframes = || self.images.iter().map(|image| &*image.keyframe);
+        let extent = Extent::of(keyframes());
+        if self.field.as_ref().is_some_and(|(known, _)| !known.is_outgrown_by(&extent)) {
+            return Ok(());
+        }
+        let sizes = Sizes::choose(&self.options, self.effort(), self.gpu.max_binding_bytes(), keyframes(), &extent)?;
+        log::debug!("nerf: {extent:?}, {sizes:?}");
+        self.settle()?;
+        self.field = None; // Its memory is free before the next one takes some.
+        self.field = Some((extent, Learner::new(&self.gpu, &self.options, sizes)?));
+        self.n_hinted = 0;
+        Ok(())
+    }
+
+    /// Tells the field what the depth of new images says about where something is.
+    fn hint(&mut self) -> Result<(), Error> {
+        let Some((extent, learner)) = &mut self.field else { return Ok(()) };
+        let march = learner.march();
+        let depths: Vec<_> =
+            self.images[self.n_hinted..].iter().filter_map(|image| image.keyframe.depth.as_ref()).collect();
+        let hints: Vec<_> = depths.par_iter().map(|depth| carve::hints(depth, extent, &march)).collect();
+        for hints in hints {
+            learner.hint(&self.gpu, &hints)?;
+        }
+        self.n_hinted = self.images.len();
+        Ok(())
+    }
+
+    /// Waits for the submit in flight.
+    fn settle(&mut self) -> Result<(), Error> {
+        let Some(in_flight) = self.in_flight.take() else { return Ok(()) };
+        let batch = in_flight.batch.finish::<u32>(&self.gpu)?;
+        log::debug!("nerf: step {}: {} samples of {} rays", self.step, batch[1], batch[0]);
+        let millis = in_flight.since.elapsed().as_secs_f64() * 1e3 / in_flight.n_steps.max(1) as f64;
+        self.step_millis = if self.step_millis == 0.0 { millis } else { 0.8 * self.step_millis + 0.2 * millis };
+        Ok(())
+    }
+
+    /// Lists the next step as the `slot_ix`-th of a submit.
+    fn record(&mut self, slot_ix: usize) -> Result<(), Error> {
+        let Some((extent, learner)) = &mut self.field else { return Ok(()) };
+        let n_rays = learner.sizes.effort.n_rays;
+        let draw = Draw { seed: self.options.seed, step: self.step, n_rays, begin: BEGIN };
+        let rays = rays::draw(&self.images, extent, &draw);
+        learner.record_step(&self.gpu, &self.options, slot_ix, self.step, &rays)?;
+        self.step += 1;
+        Ok(())
+    }
+
+    /// Steps of a submit that take no longer than it may.
+    fn steps_per_submit(&self) -> u64 {
+        if self.step_millis == 0.0 || self.gpu.is_software() {
+            return 1;
+        }
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
+        let n = (MOST_SUBMIT_MILLIS / self.step_millis).clamp(1.0, STEPS_PER_SUBMIT as f64) as u64;
+        n
+    }
+
+    fn draw(&mut self, camera: &Camera, background_srgb: [f32; 3]) -> Result<Picture, Error> {
+        let Some((extent, learner)) = &mut self.field else {
+            return Ok(Picture::empty(camera.size_px, background_srgb));
+        };
+        learner.draw(&self.gpu, &extent.camera_in_units(camera), background_srgb, extent.radius_m)
+    }
+}
+
+impl Method for NerfModel {
+    fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
+        if keyframe.split == Split::Test {
+            return Ok(());
+        }
+        keyframe.check()?;
+        self.images.push(RayImage::new(keyframe));
+        self.is_extent_due = true;
+        Ok(())
+    }
+
+    fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
+        let is_meant = |image: &RayImage| image.keyframe.camera.as_ref() == camera && image.keyframe.stamp == stamp;
+        if let Some(ix) = self.images.iter().position(is_meant) {
+            self.images.remove(ix);
+            self.n_hinted -= usize::from(ix < self.n_hinted);
+        }
+        Ok(())
+    }
+
+    fn step(&mut self, n: u64) -> Result<u64, Error> {
+        if n == 0 || !self.begin()? {
+            self.settle()?;
+            return Ok(0);
+        }
+        let n_steps = n.min(self.steps_per_submit());
+        let since = Instant::now();
+        for slot_ix in 0..n_steps {
+            self.record(usize::try_from(slot_ix).expect("few steps"))?;
+        }
+        let Some((_, learner)) = &mut self.field else { return Err(Error::DeviceLost) };
+        let batch = learner.submit(&self.gpu);
+        self.settle()?; // The submit before; this one runs meanwhile.
+        self.in_flight = Some(InFlight { batch, n_steps, since });
+        if n_steps == n {
+            self.settle()?; // The caller stops here.
+        }
+        Ok(n_steps)
+    }
+
+    fn is_idle(&self) -> bool {
+        self.images.is_empty()
+    }
+
+    fn primitive(&self) -> &'static str {
+        "entry"
+    }
+
+    fn n_taken(&mut self) -> Result<u64, Error> {
+        self.settle()?;
+        Ok(self.step)
+    }
+
+    /// Nothing can be drawn before something was learned.
+    fn seed(&mut self) -> Result<(), Error> {
+        self.begin().map(drop)
+    }
+
+    /// Compiles with the sizes that the keyframes so far ask for.
+    fn prepare(&mut self) -> Result<(), Error> {
+        self.begin().map(drop)
+    }
+
+    fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
+        self.settle()?;
+        self.begin()?;
+        match request.projection {
+            Projection::Pinhole { focal_px, principal_px } => {
+                self.draw(&Camera::of_request(request, focal_px, principal_px), request.background_srgb)
+            }
+            Projection::Equirectangular => {
+                equirect::render(request, |camera| self.draw(camera, request.background_srgb))
+            }
+        }
+    }
+
+    fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {
+        Ok(PosedLens::of(keyframe))
+    }
+
+    fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
+        self.settle()?;
+        if !self.begin()? {
+            return Ok(Vec::new());
+        }
+        self.record(0)?;
+        let Some((_, learner)) = &mut self.field else { return Err(Error::DeviceLost) };
+        learner.submit_timed(&self.gpu)
+    }
+
+    fn alignment(&self) -> Option<&Alignment> {
+        None
+    }
+
+    fn progress(&self) -> Progress {
+        let field = self.field.as_ref().map(|(_, learner)| learner);
+        Progress {
+            step: self.step,
+            primitives: field.map_or(0, |learner| learner.field.n_entries.into()),
+            bytes: field.map_or(0, Learner::bytes),
+            step_millis: self.step_millis,
+        }
+    }
+
+    fn report(&self) -> Vec<Part> {
+        Vec::new()
+    }
+
+    fn save(&mut self, folder: &Path) -> Result<(), Error> {
+        self.write_folder(folder)
+    }
+
+    fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
+        self.take_checkpoint()
+    }
+}

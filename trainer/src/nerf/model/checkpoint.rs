@@ -1,0 +1,171 @@
+//! The state of a field on the way, and a field in a folder.
+
+use super::NerfModel;
+use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
+use crate::gpu::{Buffer, Gpu, PendingRead};
+use crate::nerf::extent::Extent;
+use crate::nerf::learner::Learner;
+use crate::nerf::options::NerfOptions;
+use crate::nerf::rays::RayImage;
+use crate::nerf::sizes::Sizes;
+use crate::seen::{self, Seen};
+use crate::{Error, Keyframe, Method};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+use std::sync::Arc;
+
+const METHOD: &str = "nerf";
+/// The field: a checkpoint of what pictures need.
+const FIELD: &str = "field.nerf";
+
+/// All but the arrays.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct State {
+    options: NerfOptions,
+    step: u64,
+    images: Vec<Seen>,
+    is_extent_due: bool,
+    n_hinted: usize,
+    /// Where there is a field.
+    field: Option<(Extent, Sizes)>,
+}
+
+fn bad_state(reason: String) -> Error {
+    Error::CheckpointState { reason }
+}
+
+impl Learner {
+    /// What pictures need, by name.
+    fn drawn(&self) -> Vec<(String, &Buffer)> {
+        let mut all = vec![("grid".to_owned(), &self.field.grid), ("occupied".to_owned(), &self.occupancy.occupied)];
+        for (name, weights) in [("density", &self.field.density), ("color", &self.field.color)] {
+            all.extend(weights.iter().enumerate().map(|(ix, buffer)| (format!("{name}_{ix}"), buffer)));
+        }
+        all
+    }
+
+    /// All that decides how it goes on, by name.
+    fn learned(&self) -> Vec<(String, &Buffer)> {
+        let mut all = self.drawn();
+        all.extend(
+            [
+                ("grid_moments", &self.moments.grid),
+                ("scales", &self.slopes.scales),
+                ("counts", &self.slopes.counts),
+                ("steps", &self.moments.steps),
+                ("pace", &self.moments.pace),
+                ("thickness", &self.occupancy.thickness),
+            ]
+            .map(|(name, buffer)| (name.to_owned(), buffer)),
+        );
+        for (name, moments) in [("density", &self.moments.density), ("color", &self.moments.color)] {
+            all.extend(moments.iter().enumerate().map(|(ix, buffer)| (format!("{name}_{ix}_moments"), buffer)));
+        }
+        all
+    }
+}
+
+/// Buffers on their way to the host.
+fn begin_read(gpu: &Gpu, buffers: Vec<(String, &Buffer)>) -> Vec<(String, PendingRead)> {
+    let read = |buffer: &Buffer| {
+        gpu.begin_read(buffer, usize::try_from(buffer.bytes() / 4).expect("a buffer fits into memory"))
+    };
+    buffers.into_iter().map(|(name, buffer)| (name, read(buffer))).collect()
+}
+
+fn finish(gpu: &Gpu, reads: Vec<(String, PendingRead)>) -> Result<Vec<Array>, Error> {
+    reads.into_iter().map(|(name, read)| Ok(Array { name, bytes: read.finish(gpu)? })).collect()
+}
+
+impl NerfModel {
+    /// Whether a folder holds a saved field.
+    pub fn is_saved_in(folder: &Path) -> bool {
+        folder.join(FIELD).is_file()
+    }
+
+    fn state(&self) -> Result<serde_json::Value, Error> {
+        let state = State {
+            options: NerfOptions { effort: Some(self.effort()), ..self.options.clone() },
+            step: self.step,
+            images: self.images.iter().map(|image| Seen::of(&image.keyframe)).collect(),
+            is_extent_due: self.is_extent_due,
+            n_hinted: self.n_hinted,
+            field: self.field.as_ref().map(|(extent, learner)| (*extent, learner.sizes.clone())),
+        };
+        serde_json::to_value(state).map_err(|error| bad_state(error.to_string()))
+    }
+
+    pub(super) fn take_checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
+        self.settle()?;
+        let (gpu, state) = (self.gpu.clone(), self.state()?);
+        let reads = self.field.as_ref().map_or(Vec::new(), |(_, learner)| begin_read(&gpu, learner.learned()));
+        Ok(PendingCheckpoint::new(move || {
+            Ok(Checkpoint { method: METHOD.to_owned(), seconds: 0.0, state, arrays: finish(&gpu, reads)? })
+        }))
+    }
+
+    /// The model that a checkpoint holds with some of its buffers, without keyframes.
+    fn of_state(
+        gpu: Arc<Gpu>,
+        checkpoint: &Checkpoint,
+        buffers: impl Fn(&Learner) -> Vec<(String, &Buffer)>,
+    ) -> Result<(Self, State), Error> {
+        if checkpoint.method != METHOD {
+            return Err(bad_state(format!("it is of the method {:?}", checkpoint.method)));
+        }
+        let state: State =
+            serde_json::from_value(checkpoint.state.clone()).map_err(|error| bad_state(error.to_string()))?;
+        let mut model = Self::new(gpu, state.options.clone())?;
+        if let Some((extent, sizes)) = &state.field {
+            sizes.check()?;
+            let learner = Learner::new(&model.gpu, &model.options, sizes.clone())?;
+            for (name, buffer) in buffers(&learner) {
+                model.gpu.write(buffer, 0, checkpoint.array(&name, buffer.bytes())?);
+            }
+            model.field = Some((*extent, learner));
+        }
+        model.step = state.step;
+        Ok((model, state))
+    }
+
+    /// Goes on from a checkpoint as if learning had not stopped. What it had learned from must be among `keyframes`; the
+    /// others come back, to be pushed or kept for testing.
+    pub fn resume(
+        gpu: Arc<Gpu>,
+        checkpoint: &Checkpoint,
+        keyframes: &[Arc<Keyframe>],
+    ) -> Result<(Self, Vec<Arc<Keyframe>>), Error> {
+        let (mut model, state) = Self::of_state(gpu, checkpoint, Learner::learned)?;
+        let (images, rest) = seen::matched(&state.images, keyframes, Arc::clone)?;
+        model.images = images.into_iter().map(RayImage::new).collect();
+        model.is_extent_due = state.is_extent_due;
+        model.n_hinted = state.n_hinted.min(model.images.len());
+        Ok((model, rest))
+    }
+
+    /// A saved field, to be drawn.
+    pub fn load(gpu: Arc<Gpu>, folder: &Path) -> Result<Self, Error> {
+        let checkpoint = Checkpoint::read(&folder.join(FIELD))?;
+        Ok(Self::of_state(gpu, &checkpoint, Learner::drawn)?.0)
+    }
+
+    pub(super) fn write_folder(&mut self, folder: &Path) -> Result<(), Error> {
+        self.settle()?;
+        let refused = |path: &Path, source| Error::Write { path: path.to_owned(), source };
+        std::fs::create_dir_all(folder).map_err(|source| refused(folder, source))?;
+        let reads = self.field.as_ref().map_or(Vec::new(), |(_, learner)| begin_read(&self.gpu, learner.drawn()));
+        let (state, arrays) = (self.state()?, finish(&self.gpu, reads)?);
+        Checkpoint { method: METHOD.to_owned(), seconds: 0.0, state, arrays }.write(&folder.join(FIELD))?;
+        let sizes = self.field.as_ref().map(|(_, learner)| &learner.sizes);
+        let about = serde_json::json!({
+            "method": METHOD,
+            "steps": self.step,
+            "entries": self.progress().primitives,
+            "levels": sizes.map(|sizes| &sizes.n_cells),
+            "extent": self.extent(),
+        });
+        let path = folder.join("model.json");
+        std::fs::write(&path, format!("{about:#}\n")).map_err(|source| refused(&path, source))
+    }
+}

@@ -1,0 +1,57 @@
+// place_samples: where the samples of each ray begin, and how many rays may have at most so that there is room for all.
+//
+// threads   256, in one workgroup
+// reads     march, n_found
+// writes    rays (first_sample, n_samples), batch (n_samples, most_samples)
+
+#import ray_batch
+#import march_params
+#import scan
+
+@group(0) @binding(0) var<storage, read_write> batch: Batch;
+@group(0) @binding(1) var<uniform> march: March;
+@group(0) @binding(2) var<storage, read> n_found: array<u32>;
+@group(0) @binding(3) var<storage, read_write> rays: array<Ray>;
+
+override CAPACITY: u32;
+
+var<workgroup> wg_n_samples: u32;
+
+fn n_kept(ray_ix: u32, most_samples: u32) -> u32 {
+    let found = n_found[ray_ix];
+    let thinning = thinning_of(most_samples, rays[ray_ix], found);
+    return (found + thinning.stride - 1u - thinning.phase) / thinning.stride;
+}
+
+@compute @workgroup_size(256)
+fn main(@builtin(local_invocation_index) lane: u32) {
+    let n_rays = batch.n_rays;
+    var most_samples = march.most_samples;
+    loop {
+        var sum = 0u;
+        for (var ray_ix = lane; ray_ix < n_rays; ray_ix += SCAN_LANES) { sum += n_kept(ray_ix, most_samples); }
+        var total: u32;
+        let below = exclusive_scan(lane, sum, &total);
+        if lane == 0u { wg_n_samples = total; }
+        let n_samples = workgroupUniformLoad(&wg_n_samples);
+        if n_samples <= CAPACITY || most_samples <= 1u { break; }
+        most_samples /= 2u;
+    }
+    var begin = 0u;
+    for (var first = 0u; first < arrayLength(&rays); first += SCAN_LANES) {
+        let ray_ix = first + lane;
+        var n = 0u;
+        if ray_ix < n_rays { n = n_kept(ray_ix, most_samples); }
+        var total: u32;
+        let own = begin + exclusive_scan(lane, n, &total);
+        if ray_ix < n_rays {
+            rays[ray_ix].first_sample = min(own, CAPACITY);
+            rays[ray_ix].n_samples = select(0u, n, own + n <= CAPACITY);
+        }
+        begin += total;
+    }
+    if lane == 0u {
+        batch.n_samples = min(begin, CAPACITY);
+        batch.most_samples = most_samples;
+    }
+}

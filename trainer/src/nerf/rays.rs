@@ -1,0 +1,119 @@
+//! Rays that a step learns from: pixels of all keyframes, chosen by a hash of seed, step and place in the batch.
+
+use super::extent::Extent;
+use super::params;
+use crate::Keyframe;
+use crate::gpu::{f32_of, f32s_of};
+use crate::splat::depth_in_color_view;
+use nalgebra::Vector3;
+use rayon::prelude::*;
+use std::sync::Arc;
+
+/// Rays that one task draws.
+const RAYS_PER_TASK: usize = 512;
+/// Tries to find a pixel that was seen.
+const TRIES: u64 = 4;
+/// Where rays end: far beyond this the field tells nothing apart.
+const END: f32 = 1e3;
+
+/// A keyframe that rays are drawn from.
+#[derive(Clone, Debug)]
+pub(crate) struct RayImage {
+    pub(crate) keyframe: Arc<Keyframe>,
+    /// Of each pixel, metres along z; 0 where unknown; empty where there is none.
+    depth_m: Arc<[f32]>,
+}
+
+impl RayImage {
+    pub(crate) fn new(keyframe: Arc<Keyframe>) -> Self {
+        Self { depth_m: depth_in_color_view(&keyframe), keyframe }
+    }
+
+    /// Origin, direction of length 1, and how far the depth says that the ray goes (0: it does not), in units of the
+    /// extent's radius.
+    pub(crate) fn reading(&self, extent: &Extent, pixel_ix: usize) -> ([f64; 3], [f64; 3], f64) {
+        let Keyframe { size_px: [width, height], focal_px, principal_px, .. } = &*self.keyframe;
+        let (x, y) = (pixel_ix % *width as usize, pixel_ix / *width as usize);
+        let along = |pixel: usize, axis: usize| (pixel as f64 + 0.5 - principal_px[axis]) / focal_px[axis];
+        let mut in_camera = Vector3::new(along(x, 0), along(y, 1), 1.0);
+        let mut origin_m = Vector3::zeros();
+        if let Some(twist) = &self.keyframe.twist {
+            // A point moves by -tau (v + w x p) in the camera; the ray undoes that.
+            let tau_secs = ((y as f64 + 0.5) / f64::from(*height) - 0.5) * self.keyframe.readout_secs;
+            in_camera += twist.angular_rad_s.cross(&in_camera) * tau_secs;
+            origin_m = twist.linear_m_s * tau_secs;
+        }
+        let pose = &self.keyframe.world_from_camera;
+        let origin = (pose * nalgebra::Point3::from(origin_m)).coords - Vector3::from(extent.center_m);
+        let z_m = self.depth_m.get(pixel_ix).copied().filter(|z| z.is_finite()).unwrap_or(0.0);
+        let length = in_camera.norm();
+        let distance = f64::from(z_m) * length / extent.radius_m;
+        ((origin / extent.radius_m).into(), (pose.rotation * (in_camera / length)).into(), distance.max(0.0))
+    }
+
+    /// The ray through the middle of a pixel, with what is seen there.
+    fn ray(&self, extent: &Extent, pixel_ix: usize, begin: f32, shift: f32) -> params::Ray {
+        let (origin, direction, distance) = self.reading(extent, pixel_ix);
+        let pixel = &self.keyframe.rgba_srgb[4 * pixel_ix..4 * pixel_ix + 4];
+        params::Ray {
+            origin: f32s_of(origin),
+            direction: f32s_of(direction),
+            begin,
+            end: END,
+            target_rgb: u32::from_le_bytes([pixel[0], pixel[1], pixel[2], pixel[3]]),
+            target_distance: f32_of(distance),
+            shift,
+            ..params::Ray::default()
+        }
+    }
+}
+
+/// Which rays, and how they begin.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Draw {
+    pub(crate) seed: u64,
+    pub(crate) step: u64,
+    pub(crate) n_rays: u32,
+    /// Nearest place that is looked at, in units of the radius.
+    pub(crate) begin: f32,
+}
+
+/// Rays of a step, all images alike, in the order of the images.
+pub(crate) fn draw(images: &[RayImage], extent: &Extent, draw: &Draw) -> Vec<params::Ray> {
+    if images.is_empty() {
+        return Vec::new();
+    }
+    let key = mixed(draw.seed ^ mixed(draw.step));
+    let ray = |ix: u64| {
+        let own = mixed(key ^ mixed(ix));
+        let share = (ix as f64 + unit(own)) / f64::from(draw.n_rays);
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of a length")]
+        let image_ix = ((share * images.len() as f64) as usize).min(images.len() - 1);
+        let image = &images[image_ix];
+        let n_pixels = image.keyframe.rgba_srgb.len() as u64 / 4;
+        let pick = |attempt: u64| {
+            let word = mixed(own.wrapping_add(1 + attempt));
+            // The upper half of a product of 64 bits: even over all pixels.
+            usize::try_from((u128::from(word) * u128::from(n_pixels)) >> 64).expect("less than a length")
+        };
+        let is_seen = |pixel_ix: &usize| image.keyframe.rgba_srgb[4 * pixel_ix + 3] > 0;
+        let pixel_ix = (0..TRIES).map(pick).find(is_seen).unwrap_or_else(|| pick(0));
+        let shift = f32_of(unit(mixed(own ^ 0x5bd1_e995)));
+        let code = u32::try_from(image_ix).expect("few images");
+        params::Ray { code, ..image.ray(extent, pixel_ix, draw.begin, shift) }
+    };
+    (0..draw.n_rays).into_par_iter().with_min_len(RAYS_PER_TASK).map(|ix| ray(ix.into())).collect()
+}
+
+/// A hash of a word (Steele et al. 2014, `SplitMix64`).
+pub(crate) fn mixed(word: u64) -> u64 {
+    let mut z = word.wrapping_add(0x9e37_79b9_7f4a_7c15);
+    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    z ^ (z >> 31)
+}
+
+/// 0 <= x < 1.
+pub(crate) fn unit(word: u64) -> f64 {
+    (word >> 11) as f64 / (1u64 << 53) as f64
+}

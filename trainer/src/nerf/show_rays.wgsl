@@ -1,0 +1,70 @@
+// show_rays: the pixels that rays see, after one more round of samples; rays that see no further are ended.
+//
+// threads   one per ray
+// reads     batch, march (first_ray: the first pixel; most_found: samples of a round), view, backdrop, spans, told [n_samples, 16], colors [n_samples]
+// writes    rays (begin of the next round; end), light [n_rays, 2] (rgb and transmittance; distance), pixels [n_pixels] (rgba8; a: coverage),
+//           depths [n_pixels] (metres along z, mean over what is seen; 0 where nothing is)
+// twin      nerf/reference/ray.rs
+
+#import view
+#import picture_ray
+#import ray_batch
+#import march_params
+#import density
+#import sample
+
+struct Backdrop {
+    srgb: vec3f,
+    radius_m: f32,         // of the scene: metres a unit
+}
+
+@group(0) @binding(0) var<storage, read> batch: Batch;
+@group(0) @binding(1) var<uniform> march: March;
+@group(0) @binding(2) var<uniform> view: View;
+@group(0) @binding(3) var<uniform> backdrop: Backdrop;
+@group(0) @binding(4) var<storage, read_write> rays: array<Ray>;
+@group(0) @binding(5) var<storage, read> spans: array<Span>;
+@group(0) @binding(6) var<storage, read> told: array<f32>;
+@group(0) @binding(7) var<storage, read> colors: array<vec4f>;
+@group(0) @binding(8) var<storage, read_write> pixels: array<u32>;
+@group(0) @binding(9) var<storage, read_write> depths: array<f32>;
+@group(0) @binding(10) var<storage, read_write> light: array<vec4f>;
+
+const LEAST_COVERAGE = 1e-3;
+// Behind what lets less light through nothing is looked at.
+const LEAST_TRANSMITTANCE = 1e-3;
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let ray_ix = folded(wg, n_wgs) * 64u + lane;
+    if ray_ix >= batch.n_rays { return; }
+    let ray = rays[ray_ix];
+    if ray.is_ended == 1u { return; }
+    var rgb = light[2u * ray_ix].rgb;
+    var transmittance = light[2u * ray_ix].a;
+    var distance = light[2u * ray_ix + 1u].x;
+    let end = ray.first_sample + ray.n_samples;
+    for (var ix = ray.first_sample; ix < end; ix++) {
+        let sample = sample_at(ix);
+        let weight = transmittance * (1.0 - sample.left);
+        rgb += weight * sample.rgb;
+        distance += weight * 0.5 * (sample.begin + sample.end);
+        transmittance *= sample.left;
+    }
+    light[2u * ray_ix] = vec4f(rgb, transmittance);
+    light[2u * ray_ix + 1u] = vec4f(distance, 0.0, 0.0, 0.0);
+    let goes_on = ray.n_samples == march.most_found && transmittance > LEAST_TRANSMITTANCE;
+    rays[ray_ix].shift = 0.0;
+    if goes_on {
+        rays[ray_ix].begin = spans[end - 1u].end;
+    } else {
+        rays[ray_ix].end = ray.begin; // So that nothing more is found.
+        rays[ray_ix].is_ended = 1u;
+    }
+    let pixel_ix = march.first_ray + ray_ix;
+    let pixel = ray_of_pixel(vec2u(pixel_ix % view.size_px.x, pixel_ix / view.size_px.x));
+    let coverage = 1.0 - transmittance;
+    let depth_m = distance / max(coverage, LEAST_COVERAGE) / length(pixel.along) * backdrop.radius_m;
+    pixels[pixel_ix] = pack4x8unorm(vec4f(rgb + transmittance * backdrop.srgb, coverage));
+    depths[pixel_ix] = select(0.0, depth_m, coverage >= LEAST_COVERAGE);
+}

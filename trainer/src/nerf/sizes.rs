@@ -1,0 +1,98 @@
+//! How large a field is: no larger than what its images show.
+
+use super::extent::{Extent, pixel_size_m};
+use super::options::{Effort, NerfOptions};
+use super::reference::grid::GridShape;
+use crate::{Error, Keyframe};
+use serde::{Deserialize, Serialize};
+
+/// Cells of the coarsest level along an axis.
+const COARSEST: u32 = 16;
+/// How much finer each level is than the one before.
+const GROWTH: f64 = 1.5;
+/// Finest cells are this many pixels wide: finer ones would learn noise.
+const PIXELS_PER_CELL: f64 = 1.5;
+/// Pixels of an image for each entry of a level: many images see the same place, and a surface is few of a level's cells.
+const PIXELS_PER_ENTRY: f64 = 0.5;
+const LEAST_LOG2_ENTRIES: u32 = 12;
+/// Bytes of an entry: itself, its slopes, its moments.
+const BYTES_PER_ENTRY: u64 = 8 + 8 + MOMENT_BYTES_PER_ENTRY;
+const MOMENT_BYTES_PER_ENTRY: u64 = 16;
+
+/// All sizes of a field and of its batches.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Sizes {
+    /// Cells of each level along an axis.
+    pub(crate) n_cells: Vec<u32>,
+    pub(crate) log2_entries: u32,
+    pub(crate) n_codes: u32,
+    /// Whether depth tells where something is.
+    pub(crate) has_depth: bool,
+    pub(crate) effort: Effort,
+}
+
+impl Sizes {
+    /// Levels down to what a pixel sees, and entries for what an image shows, as far as limits allow.
+    pub(crate) fn choose<'a>(
+        options: &NerfOptions,
+        effort: Effort,
+        max_binding_bytes: u64,
+        keyframes: impl Iterator<Item = &'a Keyframe> + Clone,
+        extent: &Extent,
+    ) -> Result<Self, Error> {
+        // The unit cube is four radii wide as the inner cube has it.
+        let cell_m = PIXELS_PER_CELL * pixel_size_m(keyframes.clone(), extent);
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
+        let finest = (4.0 * extent.radius_m / cell_m).clamp(64.0, 8192.0) as u32;
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few")]
+        let n_levels = 1 + (f64::from(finest / COARSEST).ln() / GROWTH.ln()).ceil() as u32;
+        let n_levels = n_levels.next_multiple_of(2).clamp(4, effort.most_levels.clamp(4, 16));
+        let has_depth = keyframes.clone().any(|keyframe| keyframe.depth.is_some());
+        let n_pixels = keyframes.map(|keyframe| keyframe.rgba_srgb.len() / 4).max().unwrap_or(0);
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a logarithm")]
+        let wanted = (n_pixels.max(1) as f64 / PIXELS_PER_ENTRY).log2().ceil() as u32;
+        let most = effort.most_log2_entries.max(LEAST_LOG2_ENTRIES);
+        let mut log2_entries = wanted.clamp(LEAST_LOG2_ENTRIES, most);
+        let max_bytes = options.max_bytes.unwrap_or(u64::MAX);
+        loop {
+            let shape = GridShape::between(COARSEST, finest, n_levels, log2_entries);
+            let n_entries = u64::from(shape.n_entries_in_all());
+            let fits =
+                n_entries * BYTES_PER_ENTRY <= max_bytes && n_entries * MOMENT_BYTES_PER_ENTRY <= max_binding_bytes;
+            if fits {
+                return Ok(Self { n_cells: shape.n_cells, log2_entries, n_codes: 1, has_depth, effort });
+            }
+            if log2_entries == LEAST_LOG2_ENTRIES {
+                return Err(Error::BudgetTooSmall { max_bytes, least_bytes: n_entries * BYTES_PER_ENTRY });
+            }
+            log2_entries -= 1;
+        }
+    }
+
+    pub(crate) fn shape(&self) -> GridShape {
+        GridShape { n_cells: self.n_cells.clone(), log2_entries: self.log2_entries }
+    }
+
+    /// Refuses sizes that no field has.
+    pub(crate) fn check(&self) -> Result<(), Error> {
+        let Effort { n_rays, n_samples, n_hidden, n_cells, n_steps, .. } = self.effort;
+        let rises = self.n_cells.windows(2).all(|pair| pair[0] <= pair[1]);
+        let is_usable = (1..=16).contains(&self.n_cells.len())
+            && self.n_cells.iter().all(|n| (1..=1 << 20).contains(n))
+            && rises
+            && (1..=28).contains(&self.log2_entries)
+            && self.n_codes > 0
+            && (1..=1 << 20).contains(&n_rays)
+            && (n_rays..=1 << 24).contains(&n_samples)
+            && (4..=256).contains(&n_hidden)
+            && n_cells.is_power_of_two()
+            && (4..=512).contains(&n_cells)
+            && n_steps > 0;
+        if is_usable {
+            Ok(())
+        } else {
+            Err(Error::CheckpointState { reason: format!("no field has such sizes: {self:?}") })
+        }
+    }
+}

@@ -1,0 +1,350 @@
+//! The whole field: it learns what a scene looks like, the same twice, and goes on where it stopped.
+
+use super::carve;
+use super::extent::Extent;
+use super::options::{Effort, NerfOptions};
+use super::rays::{self, Draw, RayImage};
+use super::reference::march::March;
+use super::sizes::Sizes;
+use super::{NerfModel, params};
+use crate::eval::{self, PixelPair};
+use crate::gpu::{Gpu, GpuOptions};
+use crate::test_scenes as scenes;
+use crate::{Aabb, DepthMap, Error, Keyframe, Method, Picture, Projection, RenderRequest, Split};
+use kinematics::{Transform, Twist};
+use nalgebra::{Point3, Vector3};
+use std::sync::Arc;
+
+/// The ball's middle.
+const AT: Point3<f64> = Point3::new(0.3, -0.2, 0.1);
+const N_STEPS: u64 = 160;
+
+fn options() -> NerfOptions {
+    let effort = Effort {
+        n_rays: 256,
+        n_samples: 1 << 13,
+        n_hidden: 16,
+        n_cells: 32,
+        n_steps: 64,
+        most_log2_entries: 13,
+        most_levels: 6,
+    };
+    NerfOptions { effort: Some(effort), n_planned_steps: 300, ..NerfOptions::default() }
+}
+
+/// The ball alone: pixels beside it are black, and have no depth.
+fn ball(n: usize) -> Vec<Arc<Keyframe>> {
+    scenes::ring(&[scenes::ball(AT)], AT, n)
+}
+
+/// A ball on a floor, seen from above so that all that is seen is near.
+fn ball_on_floor(n: usize) -> Vec<Arc<Keyframe>> {
+    let view = |ix: usize| {
+        let turn = 0.8 * ix as f64;
+        let eye = AT + Vector3::new(0.6 * turn.cos(), 0.6 * turn.sin(), 1.1);
+        let shapes = [scenes::ball(AT), scenes::floor()];
+        Arc::new(scenes::keyframe(i64::try_from(ix).unwrap(), &shapes, scenes::looking(eye, AT)))
+    };
+    (0..n).map(view).collect()
+}
+
+fn gpu() -> Arc<Gpu> {
+    Gpu::open(&GpuOptions::default()).unwrap()
+}
+
+fn started(options: NerfOptions, keyframes: &[Arc<Keyframe>]) -> NerfModel {
+    let mut model = NerfModel::new(gpu(), options).unwrap();
+    for keyframe in keyframes {
+        model.push(keyframe.clone()).unwrap();
+    }
+    model
+}
+
+/// Learns up to a step.
+fn learn(model: &mut NerfModel, end: u64) {
+    while model.progress().step < end {
+        model.step(end - model.progress().step).unwrap();
+    }
+}
+
+fn learned(keyframes: &[Arc<Keyframe>]) -> NerfModel {
+    let mut model = started(options(), keyframes);
+    learn(&mut model, N_STEPS);
+    model
+}
+
+/// The view of a keyframe.
+fn request(keyframe: &Keyframe) -> RenderRequest {
+    let Keyframe { size_px, focal_px, principal_px, .. } = *keyframe;
+    let projection = Projection::Pinhole { focal_px, principal_px };
+    let background_srgb = [0.0; 3];
+    RenderRequest { size_px, projection, background_srgb, ..scenes::request(keyframe.world_from_camera) }
+}
+
+fn psnr(picture: &Picture, keyframe: &Keyframe) -> f64 {
+    eval::psnr(&PixelPair::new(keyframe.size_px, &picture.rgba_srgb, &keyframe.rgba_srgb).unwrap()).unwrap()
+}
+
+fn state(model: &mut NerfModel) -> crate::checkpoint::Checkpoint {
+    model.checkpoint().unwrap().finish().unwrap()
+}
+
+#[test]
+fn an_unseen_view_is_drawn_with_its_depth_and_twice_the_same() {
+    const LEAST_PSNR: f64 = 20.0;
+    let all = ball_on_floor(9);
+    let unseen = &all[4];
+    let mut seen = all.clone();
+    seen.remove(4);
+    let mut model = learned(&seen);
+    let picture = model.render(&request(unseen)).unwrap();
+    let psnr = psnr(&picture, unseen);
+    assert!(psnr > LEAST_PSNR, "{psnr:.2} dB");
+    let [width, height] = unseen.size_px;
+    let middle = (height / 2 * width + width / 2) as usize;
+    let eye = unseen.world_from_camera.translation.vector;
+    let expected_m = (eye - AT.coords).norm() - 0.3;
+    assert!((f64::from(picture.depth_m[middle]) - expected_m).abs() < 0.05, "{} m", picture.depth_m[middle]);
+    assert!(picture.depth_m.iter().all(|depth| depth.is_finite()));
+
+    let mut one_by_one = started(options(), &seen);
+    while one_by_one.progress().step < N_STEPS {
+        one_by_one.step(1).unwrap();
+    }
+    assert!(state(&mut model) == state(&mut one_by_one), "steps of a submit are not those of many");
+    let mut other = started(NerfOptions { seed: 1, ..options() }, &seen);
+    learn(&mut other, 4);
+    let mut first = started(options(), &seen);
+    learn(&mut first, 4);
+    assert!(state(&mut other).arrays != state(&mut first).arrays, "the seed changes nothing");
+}
+
+#[test]
+fn two_halves_give_the_bits_of_the_whole_and_a_saved_field_draws_the_same() {
+    let keyframes = ball(6);
+    let mut half = started(options(), &keyframes[..4]);
+    learn(&mut half, 70);
+    half.push(keyframes[4].clone()).unwrap();
+    let checkpoint = state(&mut half);
+    let (mut rest, unseen) = NerfModel::resume(gpu(), &checkpoint, &keyframes).unwrap();
+    assert_eq!(unseen.len(), 1);
+    learn(&mut half, N_STEPS);
+    learn(&mut rest, N_STEPS);
+    assert!(state(&mut half) == state(&mut rest));
+
+    let folder = tempfile::tempdir().unwrap();
+    half.save(folder.path()).unwrap();
+    assert!(NerfModel::is_saved_in(folder.path()));
+    let mut loaded = NerfModel::load(gpu(), folder.path()).unwrap();
+    let request = request(&keyframes[1]);
+    let (drawn, again) = (half.render(&request).unwrap(), loaded.render(&request).unwrap());
+    assert!(drawn.rgba_srgb == again.rgba_srgb && drawn.depth_m == again.depth_m);
+    assert!(loaded.is_idle() && loaded.step(3).unwrap() == 0);
+
+    let other_lens = Arc::new(Keyframe { focal_px: [80.0; 2], ..(*keyframes[2]).clone() });
+    let mut changed = keyframes.clone();
+    changed[2] = other_lens;
+    let error = NerfModel::resume(gpu(), &checkpoint, &changed).unwrap_err();
+    assert!(error.to_string().contains("has another lens"), "{error}");
+}
+
+#[test]
+fn it_learns_without_depth_too() {
+    let strip = |keyframe: &Arc<Keyframe>| Arc::new(Keyframe { depth: None, ..(**keyframe).clone() });
+    let keyframes: Vec<_> = ball(9).iter().map(strip).collect();
+    let mut model = started(options(), &keyframes);
+    learn(&mut model, 2);
+    let before = psnr(&model.render(&request(&keyframes[2])).unwrap(), &keyframes[2]);
+    learn(&mut model, N_STEPS);
+    let after = psnr(&model.render(&request(&keyframes[2])).unwrap(), &keyframes[2]);
+    assert!(after > before + 4.0, "{before:.2} dB, then {after:.2} dB");
+}
+
+#[test]
+fn a_crop_a_range_and_all_directions_are_drawn() {
+    let keyframes = ball(8);
+    let mut model = learned(&keyframes);
+    let request = request(&keyframes[0]);
+    let covered = |model: &mut NerfModel, request: &RenderRequest| {
+        let picture = model.render(request).unwrap();
+        picture.rgba_srgb.chunks_exact(4).filter(|pixel| pixel[3] > 128).count()
+    };
+    let whole = covered(&mut model, &request);
+    assert!(whole > 1000, "{whole} pixels");
+    let to = |x: f64| Transform::translation(AT.x, AT.y + x, AT.z);
+    let crop = |x: f64| Some(Aabb { world_from_box: to(x), min_m: [-0.5; 3], max_m: [0.5; 3] });
+    let within = covered(&mut model, &RenderRequest { crop: crop(0.0), ..request.clone() });
+    assert!(within > 1000, "{within} pixels of the ball in its box");
+    assert_eq!(covered(&mut model, &RenderRequest { crop: crop(5.0), ..request.clone() }), 0, "an empty box");
+    assert_eq!(covered(&mut model, &RenderRequest { far_m: 0.2, ..request.clone() }), 0, "before the ball");
+    // From the ball's middle there is something in all directions.
+    let all = RenderRequest {
+        world_from_camera: Transform::translation(AT.x, AT.y, AT.z),
+        size_px: [64, 32],
+        projection: Projection::Equirectangular,
+        ..request
+    };
+    let picture = model.render(&all).unwrap();
+    assert_eq!((picture.size_px, picture.depth_m.len()), ([64, 32], 64 * 32));
+}
+
+/// Numbers that no camera should send change nothing that they do not have to.
+#[test]
+fn poisoned_keyframes_leave_no_trace_of_nan() {
+    let keyframes = ball(6);
+    let depth = keyframes[0].depth.as_ref().unwrap();
+    let mut depth_m = depth.depth_m.to_vec();
+    let n = depth_m.len();
+    depth_m[n / 2 - 200..n / 2].fill(f32::NAN);
+    depth_m[n / 2..n / 2 + 200].fill(f32::INFINITY);
+    depth_m[n / 4..n / 4 + 50].fill(-1.0);
+    depth_m[n / 4 + 50..n / 4 + 90].fill(1e30);
+    let poisoned =
+        Keyframe { depth: Some(DepthMap { depth_m: depth_m.into(), ..depth.clone() }), ..(*keyframes[0]).clone() };
+    let masked = Keyframe { rgba_srgb: vec![0; keyframes[1].rgba_srgb.len()].into(), ..(*keyframes[1]).clone() };
+    let one_pixel = Keyframe { size_px: [1, 1], rgba_srgb: [255; 4].into(), depth: None, ..(*keyframes[2]).clone() };
+    let all = [Arc::new(poisoned), Arc::new(masked), Arc::new(one_pixel), keyframes[3].clone(), keyframes[5].clone()];
+    let mut model = started(options(), &all);
+    learn(&mut model, 40);
+    let checkpoint = state(&mut model);
+    let floats = ["grid", "grid_moments", "density_0", "density_1", "color_0", "color_1", "color_2"];
+    for array in checkpoint.arrays.iter().filter(|array| floats.contains(&array.name.as_str())) {
+        let values: Vec<f32> = bytemuck::pod_collect_to_vec(&array.bytes);
+        assert!(values.iter().all(|value| value.is_finite()), "{}", array.name);
+    }
+    assert!(model.render(&request(&keyframes[4])).unwrap().depth_m.iter().all(|depth| depth.is_finite()));
+    let torn = Keyframe { rgba_srgb: vec![0; 12].into(), ..(*keyframes[1]).clone() };
+    assert!(matches!(model.push(Arc::new(torn)), Err(Error::PictureBytes { .. })));
+}
+
+#[test]
+fn keyframes_for_tests_are_not_learned_from_and_removed_ones_are_forgotten() {
+    let keyframes = ball(3);
+    let mut model = started(options(), &[Arc::new(Keyframe { split: Split::Test, ..(*keyframes[0]).clone() })]);
+    assert!(model.is_idle() && model.step(5).unwrap() == 0);
+    let empty = model.render(&request(&keyframes[0])).unwrap();
+    assert!(empty.depth_m.iter().all(|depth| *depth == 0.0), "there is nothing to draw");
+    model.push(keyframes[1].clone()).unwrap();
+    assert!(!model.is_idle());
+    learn(&mut model, 2);
+    model.remove(&keyframes[1].camera, keyframes[1].stamp).unwrap();
+    assert!(model.is_idle() && model.step(5).unwrap() == 0);
+}
+
+#[test]
+fn rays_go_through_pixel_centers_at_the_time_of_their_row() {
+    let linear_m_s = Vector3::new(0.5, -0.25, 0.125);
+    let twist = Some(Twist { linear_m_s, angular_rad_s: Vector3::new(0.0, 0.0, 2.0) });
+    let still = ball(1)[0].clone();
+    let Keyframe { size_px, focal_px, principal_px, world_from_camera, .. } = *still;
+    let depth_m = vec![1.5; (size_px[0] * size_px[1]) as usize].into();
+    let depth = Some(DepthMap { size_px, focal_px, principal_px, depth_m, world_from_camera });
+    let keyframe = Keyframe { twist, readout_secs: 0.04, depth, ..(*still).clone() };
+    let extent = Extent { center_m: [0.1, 0.2, 0.3], radius_m: 2.0 };
+    let image = RayImage::new(Arc::new(keyframe.clone()));
+    let [width, height] = keyframe.size_px;
+    for (x, y) in [(0, 0), (width - 1, height - 1), (width / 2, height / 2)] {
+        let (origin, direction, distance) = image.reading(&extent, (y * width + x) as usize);
+        let tau = ((f64::from(y) + 0.5) / f64::from(height) - 0.5) * 0.04;
+        let place =
+            |pixel: u32, axis: usize| (f64::from(pixel) + 0.5 - keyframe.principal_px[axis]) / keyframe.focal_px[axis];
+        // A turn about z moves the ray's x and y.
+        let (u, v) = (place(x, 0), place(y, 1));
+        let seen = Vector3::new(u - tau * 2.0 * v, v + tau * 2.0 * u, 1.0);
+        let pose = &keyframe.world_from_camera;
+        let expected = (pose * Point3::from(linear_m_s * tau) - Point3::from(extent.center_m)) / 2.0;
+        assert!((Vector3::from(origin) - expected).norm() < 1e-12);
+        assert!((Vector3::from(direction) - pose.rotation * seen.normalize()).norm() < 1e-12);
+        assert!((distance - 1.5 * seen.norm() / 2.0).abs() < 1e-12);
+    }
+}
+
+#[test]
+fn all_images_are_drawn_from_alike_and_masked_pixels_are_avoided() {
+    let mut keyframes = ball(5);
+    let mut half_masked = keyframes[0].rgba_srgb.to_vec();
+    let n_bytes = half_masked.len();
+    half_masked[..n_bytes / 2].chunks_exact_mut(4).for_each(|pixel| pixel[3] = 0);
+    keyframes[0] = Arc::new(Keyframe { rgba_srgb: half_masked.into(), ..(*keyframes[0]).clone() });
+    let images: Vec<RayImage> = keyframes.into_iter().map(RayImage::new).collect();
+    let extent = Extent { center_m: [0.0; 3], radius_m: 1.0 };
+    let draw = Draw { seed: 3, step: 9, n_rays: 1000, begin: 0.1 };
+    let drawn: Vec<params::Ray> = rays::draw(&images, &extent, &draw);
+    for code in 0..5 {
+        let n = drawn.iter().filter(|ray| ray.code == code).count();
+        assert!((195..=205).contains(&n), "{n} rays of image {code}");
+    }
+    assert!(drawn.is_sorted_by_key(|ray| ray.code));
+    let n_masked = drawn.iter().filter(|ray| ray.target_rgb >> 24 == 0).count();
+    assert!(n_masked < 30, "{n_masked} of 200 rays of the half masked image fall on its mask");
+    assert_eq!(drawn, rays::draw(&images, &extent, &draw));
+    assert_ne!(drawn, rays::draw(&images, &extent, &Draw { step: 10, ..draw }));
+}
+
+#[test]
+fn the_extent_holds_cameras_and_what_is_near_and_far_things_call_for_no_more() {
+    let keyframes = scenes::ring(&[scenes::ball(AT), scenes::floor()], AT, 18);
+    let extent = Extent::of(keyframes.iter().map(|keyframe| &**keyframe));
+    assert!((1.0..2.5).contains(&extent.radius_m), "a floor without end makes {extent:?}");
+    let off = Vector3::from(extent.center_m) - AT.coords;
+    assert!(off.norm() < extent.radius_m, "{extent:?}");
+    let bare: Vec<Keyframe> =
+        keyframes.iter().map(|keyframe| Keyframe { depth: None, ..(**keyframe).clone() }).collect();
+    let extent = Extent::of(bare.iter());
+    assert!((Vector3::from(extent.center_m) - AT.coords).norm() < 0.05, "cameras look at the ball: {extent:?}");
+    assert!((1.0..1.5).contains(&extent.radius_m), "{extent:?}");
+    let alone = Extent::of(bare[..1].iter());
+    assert!(alone.radius_m > 0.0 && alone.center_m.iter().all(|along| along.is_finite()), "{alone:?}");
+    assert!(!extent.is_outgrown_by(&Extent { radius_m: 1.8 * extent.radius_m, ..extent }));
+    assert!(extent.is_outgrown_by(&Extent { radius_m: 2.2 * extent.radius_m, ..extent }));
+}
+
+#[test]
+fn a_field_that_is_outgrown_begins_anew_and_small_budgets_are_kept_or_refused() {
+    let near = scenes::ring(&[scenes::ball(AT)], AT, 2);
+    let far_at = AT + Vector3::new(9.0, 0.0, 0.0);
+    let far = scenes::ring(&[scenes::ball(far_at)], far_at, 2);
+    let mut model = started(options(), &near);
+    learn(&mut model, 3);
+    let before = *model.extent().unwrap();
+    far.iter().for_each(|keyframe| model.push(keyframe.clone()).unwrap());
+    learn(&mut model, 6);
+    assert!(model.extent().unwrap().radius_m > 2.0 * before.radius_m);
+    assert_eq!(model.progress().step, 6);
+
+    let bytes = model.progress().bytes;
+    let mut small = started(NerfOptions { max_bytes: Some(bytes / 2), ..options() }, &near);
+    learn(&mut small, 1);
+    let keyframes = || near.iter().map(|keyframe| &**keyframe);
+    let sizes = |max_bytes| {
+        let options = NerfOptions { max_bytes: Some(max_bytes), ..options() };
+        Sizes::choose(&options, options.effort.unwrap(), 1 << 27, keyframes(), &before)
+    };
+    let n_entries = |sizes: &Sizes| sizes.shape().n_entries_in_all();
+    assert!(n_entries(&sizes(900_000).unwrap()) < n_entries(&sizes(1 << 30).unwrap()));
+    assert!(matches!(sizes(1000), Err(Error::BudgetTooSmall { .. })));
+}
+
+#[test]
+fn depth_tells_which_cells_are_empty_and_which_hold_something() {
+    let keyframes = ball(1);
+    let depth = keyframes[0].depth.as_ref().unwrap();
+    let extent = Extent { center_m: AT.into(), radius_m: 1.0 };
+    let march = March { step: 1.0 / 32.0, most_samples: 64, n_cells: 32 };
+    let hints = carve::hints(depth, &extent, &march);
+    let told = |at: Point3<f64>| {
+        let in_units: [f64; 3] = (at - AT).into();
+        let cell = u32::try_from(march.cell(in_units).0).unwrap();
+        hints.iter().filter(|hint| **hint & 0x3fff_ffff == cell).map(|hint| hint >> 30).max()
+    };
+    let eye = Point3::from(depth.world_from_camera.translation.vector);
+    let towards = (AT - eye).normalize();
+    let surface = eye + towards * ((AT - eye).norm() - 0.3);
+    assert_eq!(told(surface), Some(2), "the near side of the ball");
+    assert_eq!(told(eye + (surface - eye) * 0.5), Some(1), "between camera and ball");
+    assert_eq!(told(AT), None, "inside of the ball");
+    let mut cells: Vec<u32> = hints.iter().filter(|hint| **hint >> 30 != 0).map(|hint| hint & 0x3fff_ffff).collect();
+    cells.sort_unstable();
+    assert!(cells.windows(2).all(|pair| pair[0] != pair[1]), "a cell is told twice");
+    assert!(hints.iter().any(|hint| hint >> 30 == 0), "beside the ball there is no end");
+}

@@ -1,0 +1,87 @@
+//! Keyframes that a model has learned from: told apart without their pixels, and found again.
+
+use crate::{Error, Keyframe, Split};
+use serde::{Deserialize, Serialize};
+use std::collections::HashMap;
+use std::sync::Arc;
+
+/// What tells one keyframe from another without its pixels.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Seen {
+    camera: String,
+    stamp_nanos: i64,
+    size_px: [u32; 2],
+    depth_size_px: Option<[u32; 2]>,
+    focal_px: [f64; 2],
+    principal_px: [f64; 2],
+    /// Translation, then rotation as x, y, z, w.
+    world_from_camera: [f64; 7],
+}
+
+impl Seen {
+    pub(crate) fn of(keyframe: &Keyframe) -> Self {
+        let pose = &keyframe.world_from_camera;
+        let (place, turn) = (pose.translation.vector, pose.rotation.coords);
+        Self {
+            camera: keyframe.camera.to_string(),
+            stamp_nanos: keyframe.stamp.0,
+            size_px: keyframe.size_px,
+            depth_size_px: keyframe.depth.as_ref().map(|depth| depth.size_px),
+            focal_px: keyframe.focal_px,
+            principal_px: keyframe.principal_px,
+            world_from_camera: [place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w],
+        }
+    }
+
+    /// Why the keyframe is not the one that was seen; `None` where it is.
+    fn difference(&self, keyframe: &Keyframe) -> Option<String> {
+        let other = Self::of(keyframe);
+        let [[width, height], [other_width, other_height]] = [self.size_px, other.size_px];
+        let what = if self.size_px != other.size_px {
+            format!("has {other_width}x{other_height} pixels, had {width}x{height}")
+        } else if self.depth_size_px != other.depth_size_px {
+            "has another depth image".to_owned()
+        } else if (self.focal_px, self.principal_px) != (other.focal_px, other.principal_px) {
+            "has another lens".to_owned()
+        } else if self.world_from_camera != other.world_from_camera {
+            "has another pose".to_owned()
+        } else {
+            return None;
+        };
+        Some(format!("image {} of camera {:?} {what}", self.stamp_nanos, self.camera))
+    }
+}
+
+/// Keyframes of a list, in its order, and the others.
+pub(crate) type Matched = (Vec<Arc<Keyframe>>, Vec<Arc<Keyframe>>);
+
+/// Finds what was seen among keyframes, each as `corrected` gives it back; it must be as it was then.
+pub(crate) fn matched(
+    seen: &[Seen],
+    keyframes: &[Arc<Keyframe>],
+    corrected: impl Fn(&Arc<Keyframe>) -> Arc<Keyframe>,
+) -> Result<Matched, Error> {
+    let by_name: HashMap<_, _> = keyframes
+        .iter()
+        .filter(|keyframe| keyframe.split != Split::Test)
+        .map(|keyframe| ((&*keyframe.camera, keyframe.stamp.0), keyframe))
+        .collect();
+    let mut found = Vec::new();
+    let mut as_given: Vec<&Arc<Keyframe>> = Vec::new();
+    for seen in seen {
+        let (camera, stamp) = (seen.camera.as_str(), seen.stamp_nanos);
+        let keyframe = by_name.get(&(camera, stamp)).ok_or_else(|| {
+            Error::CheckpointData(format!("image {stamp} of camera {camera:?} is not there to be learned from"))
+        })?;
+        let corrected = corrected(keyframe);
+        if let Some(difference) = seen.difference(&corrected) {
+            return Err(Error::CheckpointData(difference));
+        }
+        as_given.push(*keyframe);
+        found.push(corrected);
+    }
+    let was_seen = |keyframe: &Arc<Keyframe>| as_given.iter().any(|given| Arc::ptr_eq(given, keyframe));
+    let rest = keyframes.iter().filter(|keyframe| !was_seen(keyframe)).cloned().collect();
+    Ok((found, rest))
+}
