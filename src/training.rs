@@ -56,6 +56,11 @@ pub(crate) fn model(
     steps: Option<u64>,
     software: bool,
 ) -> Result<(Kind, SplatOptions), BadArgument> {
+    let kind = match &data.rig {
+        Some(rig) => Kind::of_rig(rig)?,
+        None => args.method.unwrap_or(Kind::Splat),
+    };
+    args.check_for(kind)?;
     // A trial takes hundreds of steps more: on a processor that is minutes.
     let evidence =
         Evidence { joints: data.rig.is_some(), depth: data.keyframes.iter().any(|keyframe| keyframe.depth.is_some()) };
@@ -64,7 +69,7 @@ pub(crate) fn model(
     let count = args.count(if software { HowMany::ToCap } else { HowMany::Tested });
     if let Some(rig) = &data.rig {
         let options = SplatOptions { cameras, align, count, ..method::options(&rig.train, steps)? };
-        return Ok((Kind::of_rig(rig)?, options));
+        return Ok((kind, options));
     }
     let usual = SplatOptions::default();
     let options = SplatOptions {
@@ -77,7 +82,7 @@ pub(crate) fn model(
         n_planned_steps: steps.unwrap_or(usual.n_planned_steps),
         ..usual
     };
-    Ok((args.method.unwrap_or(Kind::Splat), options))
+    Ok((kind, options))
 }
 
 /// When to stop, from `--seconds` and `--steps`; after `usual_secs` when neither is given.

@@ -77,6 +77,21 @@ pub(crate) struct Evidence {
 }
 
 impl TrainingArgs {
+    /// Refuses flags that only splats have where the scene model is another.
+    pub(crate) fn check_for(&self, kind: Kind) -> Result<(), BadArgument> {
+        let of_splats = [
+            (self.max_splats.is_some(), "--max-splats"),
+            (!self.refine.is_empty(), "--refine"),
+            (self.count.is_some(), "--count"),
+        ];
+        match of_splats.into_iter().find(|(is_given, _)| *is_given && kind != Kind::Splat) {
+            Some((_, flag)) => {
+                Err(BadArgument(format!("{flag}: only the method splat has it, and the method is {}", kind.name())))
+            }
+            None => Ok(()),
+        }
+    }
+
     /// What is found about cameras; `usual` where no flag says.
     pub(crate) fn refining(&self, evidence: Evidence, usual: Refine) -> Result<Refining, BadArgument> {
         let asked = if self.refine.is_empty() { std::slice::from_ref(&usual) } else { &self.refine };

@@ -121,7 +121,7 @@ fn arguments_that_make_no_sense_exit_with_2() {
     assert_refused(&["train", "absent", "--seconds", "NaN"], 2, &["--seconds"]);
     assert_refused(&["train", "absent", "--scale", "0.04"], 2, &["--scale", "0.05 to 1"]);
     for (flag, value) in
-        [("--max-splats", "0"), ("--max-bytes", "999"), ("--seed", "9223372036854775808"), ("--method", "nerf")]
+        [("--max-splats", "0"), ("--max-bytes", "999"), ("--seed", "9223372036854775808"), ("--method", "mesh")]
     {
         assert_refused(&["train", "absent", flag, value], 2, &[flag]);
         assert_refused(&["run", "absent.toml", flag, value], 2, &[flag]);
@@ -139,6 +139,12 @@ fn arguments_that_make_no_sense_exit_with_2() {
     let rig = changed_rig(folder.path(), "seed = 1", "seed = 2");
     assert_refused(&["run", &rig, "--sim", "--steps-per-keyframe", "3"], 2, &["--steps-per-keyframe", "--lockstep"]);
     assert_refused(&["run", "rig.toml", "--lockstep", "--from", "scan.mcap"], 2, &["--from"]);
+    for (flag, value) in [("--max-splats", "9"), ("--refine", "mount"), ("--count", "to-cap")] {
+        for method in ["nerf", "tsdf"] {
+            let run = ["run", &rig, "--sim", "--method", method, flag, value];
+            assert_refused(&run, 2, &[flag, "only the method splat", method]);
+        }
+    }
     for address in ["7105", "localhost:7105"] {
         assert_refused(&["run", "rig.toml", "--sim", "--listen", address], 2, &["127.0.0.1:7007"]);
     }

@@ -143,6 +143,19 @@ pub(crate) struct Runs<'a> {
     n_done: usize,
 }
 
+impl NamedData {
+    /// Refuses other scene models than splats, for a bench of what only those have.
+    pub(crate) fn expect_splats(&self) -> Result<(), BadArgument> {
+        match self.kind {
+            Kind::Splat => Ok(()),
+            other => {
+                let (data, method) = (&self.name, other.name());
+                Err(BadArgument(format!("{data}: this bench is of splats, and the method is {method}")))
+            }
+        }
+    }
+}
+
 impl<'a> Runs<'a> {
     /// Makes the folder.
     pub(crate) fn open(args: &'a BenchArgs, gpu: Arc<Gpu>) -> anyhow::Result<Self> {

@@ -102,6 +102,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let stop = Stop::on_ctrl_c()?;
     let rig = Rig::load(&args.rig_file, &args.overrides())?;
     let kind = Kind::of_rig(&rig)?;
+    args.training.check_for(kind)?;
     let pace = args.pace(&rig)?;
     let hub = Hub::new();
     let server = Server::start(ServerConfig { listen: args.listen }, hub.clone())?;

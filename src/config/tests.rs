@@ -130,7 +130,7 @@ const KEYS: [(&str, &str, &str); 103] = [
     ("join.max_gap_millis", "20", "0"),
     ("join.max_wait_millis", "100", "0"),
     ("join.max_range_scans", "50", "-1"),
-    ("train.method", "'tsdf'", "'nerf'"),
+    ("train.method", "'tsdf'", "'mesh'"),
     ("train.max_splats", "1_500_000", "0"),
     ("train.max_bytes", "100_000_000", "1"),
     ("train.seed", "7", "-7"),

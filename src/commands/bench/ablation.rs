@@ -78,6 +78,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let limits = training::limits(args.seconds, args.steps, USUAL_SECONDS)?;
     let mut runs = Runs::open(&args.bench, crate::commands::open_gpu()?)?;
     let data = runs.load(&args.data, &mut HashSet::new())?;
+    data.expect_splats()?;
     let asked = |change: &&Variant| args.only.is_empty() || args.only.iter().any(|word| change.name.contains(word));
     let changes: Vec<&Variant> =
         CHANGES.iter().filter(|change| is_change(change, &data.options)).filter(asked).collect();

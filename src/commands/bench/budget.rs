@@ -82,6 +82,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut runs = Runs::open(&args.bench, crate::commands::open_gpu()?)?;
     runs.expect(caps.len() * usize::try_from(args.seeds)?);
     let data = runs.load(&args.data, &mut HashSet::new())?;
+    data.expect_splats()?;
     let mut capped = Vec::new();
     let mut page = None;
     for cap in caps {

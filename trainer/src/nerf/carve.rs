@@ -3,7 +3,6 @@
 use super::extent::Extent;
 use super::reference::march::March;
 use crate::DepthMap;
-use std::collections::BTreeSet;
 
 /// What is told of a cell, as in `hint_cells.wgsl`.
 const LOOKED_AT_WITHOUT_END: u32 = 0;
@@ -15,11 +14,33 @@ const NOWHERE: f64 = 50.0;
 const OFF_FRAC: f64 = 0.03;
 
 /// Cells that an image looks at or through.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Cells {
-    without_end: BTreeSet<u32>,
-    free: BTreeSet<u32>,
-    surfaces: BTreeSet<u32>,
+    without_end: CellSet,
+    free: CellSet,
+    surfaces: CellSet,
+}
+
+/// A set of cells: a bit each.
+#[derive(Debug)]
+struct CellSet(Vec<u64>);
+
+impl CellSet {
+    fn new(n_cells: usize) -> Self {
+        Self(vec![0; n_cells.div_ceil(64)])
+    }
+
+    fn insert(&mut self, cell: usize) {
+        self.0[cell / 64] |= 1 << (cell % 64);
+    }
+
+    /// The cells that `other` has not got, in their order.
+    fn without<'a>(&'a self, other: &'a Self) -> impl Iterator<Item = u32> + 'a {
+        let words = (0u32..).zip(self.0.iter().zip(&other.0)).map(|(ix, (own, others))| (ix, own & !others));
+        words
+            .filter(|(_, word)| *word != 0)
+            .flat_map(|(ix, word)| (0..64).filter(move |bit| word >> bit & 1 == 1).map(move |bit| 64 * ix + bit))
+    }
 }
 
 /// What a depth image tells about cells, each told once.
@@ -28,7 +49,8 @@ pub(crate) fn hints(depth: &DepthMap, extent: &Extent, march: &March) -> Vec<u32
     // Rays that are half a cell apart a radius away.
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
     let stride = (0.5 * cell_m / extent.radius_m * depth.focal_px[0]).clamp(1.0, 16.0) as u32;
-    let mut cells = Cells::default();
+    let [without_end, free, surfaces, none] = [(); 4].map(|()| CellSet::new(march.n_cells.pow(3)));
+    let mut cells = Cells { without_end, free, surfaces };
     let origin = extent.in_units(&depth.world_from_camera).translation.vector.into();
     let [width, height] = depth.size_px;
     for y in (0..height).step_by(stride as usize) {
@@ -40,17 +62,17 @@ pub(crate) fn hints(depth: &DepthMap, extent: &Extent, march: &March) -> Vec<u32
             cells.walk(march, (origin, direction), reading_m / extent.radius_m);
         }
     }
-    let Cells { without_end, free, surfaces } = cells;
-    let free = free.difference(&surfaces).map(|cell| cell | LOOKED_THROUGH);
-    let without_end = without_end.into_iter().map(|cell| cell | LOOKED_AT_WITHOUT_END);
-    without_end.chain(free).chain(surfaces.iter().map(|cell| cell | SURFACE)).collect()
+    let Cells { without_end, free, surfaces } = &cells;
+    let without_end = without_end.without(&none).map(|cell| cell | LOOKED_AT_WITHOUT_END);
+    let free = free.without(surfaces).map(|cell| cell | LOOKED_THROUGH);
+    without_end.chain(free).chain(surfaces.without(&none).map(|cell| cell | SURFACE)).collect()
 }
 
 impl Cells {
     /// Follows a ray to its reading; to nowhere where that is 0.
     fn walk(&mut self, march: &March, (origin, direction): ([f64; 3], [f64; 3]), distance: f64) {
         let point = |t: f64| std::array::from_fn(|axis| origin[axis] + t * direction[axis]);
-        let cell = |t: f64| u32::try_from(march.cell(point(t)).0).expect("fewer cells than a u32 counts");
+        let cell = |t: f64| march.cell(point(t)).0;
         let width = |t: f64| 4.0 / march.n_cells as f64 * march.step_at(point(t)) / march.step;
         let is_open = distance == 0.0;
         let end = if is_open { NOWHERE } else { distance * (1.0 - OFF_FRAC) - width(distance) };
@@ -61,8 +83,9 @@ impl Cells {
             t += 0.5 * width(t);
         }
         if !is_open {
-            let around = [-1.0, -0.5, 0.0, 0.5, 1.0].map(|part| (distance + part * width(distance)).max(0.0));
-            self.surfaces.extend(around.map(cell));
+            for part in [-1.0, -0.5, 0.0, 0.5, 1.0] {
+                self.surfaces.insert(cell((distance + part * width(distance)).max(0.0)));
+            }
         }
     }
 }
