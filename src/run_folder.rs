@@ -80,13 +80,18 @@ fn lock(folder: &Path) -> anyhow::Result<()> {
 /// Saves a model beside its place first and moves it there when it is whole.
 pub(crate) fn save_model(method: &mut dyn Method, folder: &Path) -> anyhow::Result<()> {
     let unfinished = folder.join(UNFINISHED);
+    if unfinished.exists() {
+        // Of a run that was killed while it saved.
+        std::fs::remove_dir_all(&unfinished).with_context(|| format!("cannot remove {}", unfinished.display()))?;
+    }
     method.save(&unfinished)?;
     // Splats and blocks come last: a folder that holds them holds the whole model.
     for name in MODEL_FILES.iter().filter(|name| unfinished.join(name).exists()) {
         let place = folder.join(name);
         std::fs::rename(unfinished.join(name), &place).with_context(|| format!("cannot write {}", place.display()))?;
     }
-    std::fs::remove_dir_all(&unfinished).with_context(|| format!("cannot remove {}", unfinished.display()))
+    // A file that is not listed above would be lost: the folder has to be empty now.
+    std::fs::remove_dir(&unfinished).with_context(|| format!("cannot remove {}", unfinished.display()))
 }
 
 /// Writes a report as readable JSON.
