@@ -214,17 +214,17 @@ impl Method for NerfModel {
 
     /// Nothing can be drawn before something was learned.
     fn seed(&mut self) -> Result<(), Error> {
-        self.begin().map(drop)
+        Ok(())
     }
 
-    /// Compiles with the sizes that the keyframes so far ask for.
+    /// What is compiled depends on the sizes that the keyframes of the first step ask for.
     fn prepare(&mut self) -> Result<(), Error> {
-        self.begin().map(drop)
+        Ok(())
     }
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
+        // Whoever looks must not decide with which keyframes the field begins.
         self.settle()?;
-        self.begin()?;
         match request.projection {
             Projection::Pinhole { focal_px, principal_px } => {
                 self.draw(&Camera::of_request(request, focal_px, principal_px), request.background_srgb)

@@ -107,7 +107,11 @@ fn an_unseen_view_is_drawn_with_its_depth_and_twice_the_same() {
     assert!((f64::from(picture.depth_m[middle]) - expected_m).abs() < 0.05, "{} m", picture.depth_m[middle]);
     assert!(picture.depth_m.iter().all(|depth| depth.is_finite()));
 
-    let mut one_by_one = started(options(), &seen);
+    // Somebody looks before all keyframes are there.
+    let mut one_by_one = started(options(), &seen[..2]);
+    one_by_one.seed().unwrap();
+    assert!(one_by_one.render(&request(unseen)).unwrap().depth_m.iter().all(|depth| *depth == 0.0));
+    seen[2..].iter().for_each(|keyframe| one_by_one.push(keyframe.clone()).unwrap());
     while one_by_one.progress().step < N_STEPS {
         one_by_one.step(1).unwrap();
     }

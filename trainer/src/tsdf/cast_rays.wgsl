@@ -4,10 +4,10 @@
 // reads     view (in the field's frame), field, backdrop, status (bounds), keys, entries, geometry, colors
 // writes    pixels [n_pixels] (rgba8; a: 255 where there is a surface), depths [n_pixels] (metres along z; 0 where nothing is)
 // twin      tsdf/reference/cast.rs
-// source    sphere tracing: Hart 1996; in truncated fields: Newcombe et al. 2011, section 3.3; the shutter's motion to
-//           first order, as in `projection`
+// source    sphere tracing: Hart 1996; in truncated fields: Newcombe et al. 2011, section 3.3
 
 #import view
+#import picture_ray
 #import field
 #import field_status
 
@@ -123,51 +123,23 @@ struct Ray {
     end_m: f32,
 }
 
-// The part of `ray` between two corners of a box, given in the same frame as its origin and direction.
-fn clipped(range: vec2f, origin: vec3f, along: vec3f, low: vec3f, high: vec3f) -> vec2f {
-    let safe = select(along, vec3f(1e-12), abs(along) < vec3f(1e-12));
-    let a = (low - origin) / safe;
-    let b = (high - origin) / safe;
-    let enter = min(a, b);
-    let leave = max(a, b);
-    return vec2f(max(range.x, max(enter.x, max(enter.y, enter.z))), min(range.y, min(leave.x, min(leave.y, leave.z))));
-}
-
-fn rotated_back(v: vec3f) -> vec3f { // From camera to field.
-    return view.camera_row_0.xyz * v.x + view.camera_row_1.xyz * v.y + view.camera_row_2.xyz * v.z;
-}
-
 fn ray_of(pixel: vec2u) -> Ray {
-    let place_px = vec2f(pixel) + 0.5;
-    let tau = place_px.y / f32(view.size_px.y) - 0.5;
-    let direction = vec3f((place_px - view.principal_px) / view.focal_px, 1.0);
-    // A point moves by -tau (v + w x p) in the camera; the ray undoes that.
-    let turned = direction + tau * cross(view.shutter_angular.xyz, direction);
-    let origin_m = view.center_in_world.xyz + rotated_back(tau * view.shutter_linear.xyz);
-    let along_m = rotated_back(turned);
-    var range = vec2f(view.shutter_linear.w, view.shutter_angular.w);
-    if view.crop_min.w != 0.0 {
-        let o = vec4f(origin_m, 1.0);
-        let d = vec4f(along_m, 0.0);
-        let origin = vec3f(dot(view.crop_row_0, o), dot(view.crop_row_1, o), dot(view.crop_row_2, o));
-        let along = vec3f(dot(view.crop_row_0, d), dot(view.crop_row_1, d), dot(view.crop_row_2, d));
-        range = clipped(range, origin, along, view.crop_min.xyz, view.crop_max.xyz);
-    }
+    let seen = ray_of_pixel(pixel);
     var low = vec3f(0.0);
     var high = vec3f(0.0);
     for (var axis = 0u; axis < 3u; axis++) {
         low[axis] = f32(BOUNDS_BIAS - i32(status[BOUNDS_LOW + axis])) * 64.0;
         high[axis] = f32(i32(status[BOUNDS_HIGH + axis]) - BOUNDS_BIAS + 1) * 64.0;
     }
-    let origin = origin_m / field.voxel_m;
-    let along = along_m / field.voxel_m;
-    range = clipped(range, origin, along, low, high);
+    let origin = seen.origin / field.voxel_m;
+    let along = seen.along / field.voxel_m;
+    let range = within_box(seen.range, origin, along, low, high);
     return Ray(origin, along, range.x, range.y);
 }
 
 // Depth at which the ray leaves the box of `size` voxels that begins at `corner`.
 fn leaves(ray: Ray, corner: vec3i, size: i32) -> f32 {
-    return clipped(vec2f(0.0, 1e30), ray.origin, ray.along, vec3f(corner), vec3f(corner + size)).y;
+    return within_box(vec2f(0.0, 1e30), ray.origin, ray.along, vec3f(corner), vec3f(corner + size)).y;
 }
 
 // Depth of the crossing between a place outside and one inside; UNKNOWN where what lies between was not seen.

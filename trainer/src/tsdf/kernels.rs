@@ -9,8 +9,14 @@ macro_rules! source {
     };
 }
 
-const SHARED: &[Source] =
-    &[source!("view"), source!("field"), source!("field_status"), source!("field_insert"), source!("depth_frame")];
+const SHARED: &[Source] = &[
+    source!("view"),
+    source!("picture_ray"),
+    source!("field"),
+    source!("field_status"),
+    source!("field_insert"),
+    source!("depth_frame"),
+];
 
 macro_rules! kernel {
     ($name:literal) => {
