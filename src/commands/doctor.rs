@@ -6,6 +6,7 @@ use serde::Serialize;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
+use trainer::gpu::Gpu;
 
 /// A model of a million splats with its keyframes and the optimiser's state fits into this.
 const ENOUGH_MEMORY_KIB: u64 = 4 << 20;
@@ -88,8 +89,13 @@ fn gpu() -> Vec<Finding> {
     let gpu = match super::open_gpu() {
         Ok(gpu) => gpu,
         Err(error) => {
-            let mend =
-                "sudo apt-get install -y libvulkan1 mesa-vulkan-drivers   (in software; a GPU needs its own driver)";
+            let adapters = Gpu::adapters();
+            let mend = if adapters.is_empty() {
+                "sudo apt-get install -y libvulkan1 mesa-vulkan-drivers   (in software; a GPU needs its own driver)"
+                    .to_owned()
+            } else {
+                format!("unset FIELDRIG_GPU, or let it name one of: {}", numbered(&adapters))
+            };
             return vec![Finding::fail("gpu", error.to_string(), mend)];
         }
     };
@@ -104,7 +110,17 @@ fn gpu() -> Vec<Finding> {
     let timestamps = if optional.timestamps { "yes" } else { "no: times per pass are not known" };
     let mib = gpu.max_binding_bytes() >> 20;
     let says = format!("largest buffer {mib} MiB, subgroup lanes {lanes}, timestamps {timestamps}");
-    vec![adapter, Finding::ok("gpu limits", says)]
+    let mut findings = vec![adapter, Finding::ok("gpu limits", says)];
+    let adapters = Gpu::adapters();
+    if adapters.len() > 1 {
+        findings.push(Finding::ok("gpus", format!("{}; FIELDRIG_GPU=N picks one", numbered(&adapters))));
+    }
+    findings
+}
+
+fn numbered(names: &[String]) -> String {
+    let names: Vec<_> = names.iter().enumerate().map(|(ix, name)| format!("{ix}: {name}")).collect();
+    names.join(", ")
 }
 
 fn simulation() -> Finding {

@@ -13,7 +13,7 @@ pub(crate) mod run;
 pub(crate) mod train;
 
 use crate::cli::Command;
-use crate::exit::Exit;
+use crate::exit::{BadArgument, Exit};
 use std::sync::Arc;
 use trainer::gpu::{Gpu, GpuOptions};
 
@@ -34,12 +34,20 @@ pub(crate) fn run(command: Command) -> anyhow::Result<Exit> {
     }
 }
 
-/// Opens the GPU; `FIELDRIG_GPU_FEATURES=none` does without everything optional.
-fn open_gpu() -> Result<Arc<Gpu>, trainer::Error> {
+/// Opens the GPU; `FIELDRIG_GPU` says which one of several, and `FIELDRIG_GPU_FEATURES=none` does without everything
+/// optional.
+fn open_gpu() -> anyhow::Result<Arc<Gpu>> {
     open_gpu_with(GpuOptions::default())
 }
 
-fn open_gpu_with(options: GpuOptions) -> Result<Arc<Gpu>, trainer::Error> {
+fn open_gpu_with(options: GpuOptions) -> anyhow::Result<Arc<Gpu>> {
     let optional_features = std::env::var_os("FIELDRIG_GPU_FEATURES").is_none_or(|value| value != "none");
-    Gpu::open(&GpuOptions { optional_features, ..options })
+    let adapter = match std::env::var("FIELDRIG_GPU") {
+        Ok(text) => {
+            let is_wrong = |_| BadArgument(format!("FIELDRIG_GPU: {text:?} is not the number of a GPU"));
+            Some(text.parse().map_err(is_wrong)?)
+        }
+        Err(_) => None,
+    };
+    Ok(Gpu::open(&GpuOptions { optional_features, adapter, ..options })?)
 }

@@ -6,6 +6,7 @@ use crate::{method, print};
 use anyhow::Context;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 use trainer::{Aabb, Picture, Projection, RenderRequest};
 
 /// Size of a picture where nobody says one.
@@ -86,6 +87,8 @@ struct Drawn {
     #[serde(skip_serializing_if = "Option::is_none")]
     depth: Option<PathBuf>,
     size_px: [u32; 2],
+    /// Wall time from the request to the pixels.
+    draw_ms: f64,
 }
 
 /// Draws every stand of the path.
@@ -101,8 +104,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make the folder {}", args.out.display()))?;
     let bar = print::bar(Some(requests.len() as u64), "{bar:30} {pos} of {len}", args.json);
     for (ix, request) in requests.iter().enumerate() {
+        let since = Instant::now();
         let picture = model.render(request)?;
-        let drawn = write(&args.out, ix, &picture, args.depth)?;
+        let draw_ms = since.elapsed().as_secs_f64() * 1e3;
+        let (picture, depth) = write(&args.out, ix, &picture, args.depth)?;
+        let drawn = Drawn { picture, depth, size_px, draw_ms };
         bar.inc(1);
         if args.json {
             print::json(&drawn)?;
@@ -146,7 +152,8 @@ impl Args {
     }
 }
 
-fn write(folder: &Path, ix: usize, picture: &Picture, with_depth: bool) -> anyhow::Result<Drawn> {
+/// The picture's file, and the depth's.
+fn write(folder: &Path, ix: usize, picture: &Picture, with_depth: bool) -> anyhow::Result<(PathBuf, Option<PathBuf>)> {
     let [width, height] = picture.size_px;
     let file = folder.join(format!("{ix:05}.png"));
     image::save_buffer(&file, &picture.rgba_srgb, width, height, image::ExtendedColorType::Rgba8)
@@ -155,7 +162,7 @@ fn write(folder: &Path, ix: usize, picture: &Picture, with_depth: bool) -> anyho
     if let Some(depth) = &depth {
         write_npy(depth, picture).with_context(|| format!("cannot write {}", depth.display()))?;
     }
-    Ok(Drawn { picture: file, depth, size_px: picture.size_px })
+    Ok((file, depth))
 }
 
 /// Depth as `[height, width]` of 32-bit floats.
@@ -192,11 +199,11 @@ mod tests {
         let folder = tempfile::tempdir().expect("folder");
         let picture =
             Picture { size_px: [2, 3], rgba_srgb: vec![255; 24], depth_m: vec![0.0, 1.0, 2.0, 3.0, 4.0, 5.5] };
-        let drawn = write(folder.path(), 7, &picture, true).expect("written");
-        let bytes = std::fs::read(drawn.depth.expect("asked for")).expect("a file");
+        let (file, depth) = write(folder.path(), 7, &picture, true).expect("written");
+        let bytes = std::fs::read(depth.expect("asked for")).expect("a file");
         let read = npyz::NpyFile::new(&bytes[..]).expect("npy");
         assert_eq!(read.shape(), [3, 2]);
         assert_eq!(read.into_vec::<f32>().expect("floats"), picture.depth_m);
-        assert!(drawn.picture.ends_with("00007.png"));
+        assert!(file.ends_with("00007.png"));
     }
 }

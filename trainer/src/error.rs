@@ -12,6 +12,14 @@ pub enum Error {
     /// No GPU, real or software, answers.
     #[error("no GPU adapter found: install a Vulkan driver (software: the package mesa-vulkan-drivers)")]
     NoAdapter,
+    /// The adapter that was asked for is not there.
+    #[error("there is no GPU {ix}: {n_adapters} are there, counted from 0")]
+    NoSuchAdapter {
+        /// Counted from 0.
+        ix: usize,
+        /// How many there are.
+        n_adapters: usize,
+    },
     /// The adapter is there but refuses a device.
     #[error("GPU {adapter:?} refuses a device")]
     NoDevice {

@@ -3,6 +3,7 @@
 mod ablation;
 mod budget;
 mod curve;
+mod field;
 mod kernels;
 mod stability;
 
@@ -20,6 +21,8 @@ pub(crate) struct Args {
 enum What {
     /// Time of a picture and of a training step on a synthetic cloud of splats, by size and count
     Kernels(kernels::Args),
+    /// Time of a training step of a neural field on synthetic rays, by number of samples
+    Field(field::Args),
     /// PSNR of held-out images over seconds of training, several seeds each; peers' figures can be drawn in
     Curve(curve::Args),
     /// PSNR of held-out images over the number of splats, and what the trainer takes by itself
@@ -33,6 +36,7 @@ enum What {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     match &args.what {
         What::Kernels(args) => kernels::run(args).map(|()| Exit::Done),
+        What::Field(args) => field::run(args).map(|()| Exit::Done),
         What::Curve(args) => curve::run(args),
         What::Budget(args) => budget::run(args),
         What::Ablation(args) => ablation::run(args),

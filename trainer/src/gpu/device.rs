@@ -14,11 +14,13 @@ pub struct GpuOptions {
     pub float_atomics: bool,
     /// Lowers the largest binding, bytes; for tests of buffer limits.
     pub max_binding_bytes: Option<u64>,
+    /// Which of [`Gpu::adapters`]; else the fastest.
+    pub adapter: Option<usize>,
 }
 
 impl Default for GpuOptions {
     fn default() -> Self {
-        Self { optional_features: true, float_atomics: false, max_binding_bytes: None }
+        Self { optional_features: true, float_atomics: false, max_binding_bytes: None, adapter: None }
     }
 }
 
@@ -35,21 +37,46 @@ pub struct Gpu {
     next_id: AtomicU64,
 }
 
+/// Where compute kernels run.
+const BACKENDS: wgpu::Backends = wgpu::Backends::VULKAN.union(wgpu::Backends::METAL).union(wgpu::Backends::DX12);
+
+fn instance() -> wgpu::Instance {
+    wgpu::Instance::new(wgpu::InstanceDescriptor {
+        backends: BACKENDS,
+        flags: wgpu::InstanceFlags::empty(),
+        memory_budget_thresholds: wgpu::MemoryBudgetThresholds::default(),
+        backend_options: wgpu::BackendOptions::default(),
+        display: None,
+    })
+}
+
+fn all_adapters(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
+    pollster::block_on(instance.enumerate_adapters(BACKENDS))
+}
+
 impl Gpu {
-    /// Opens the fastest adapter there is; a software one serves when there is no other.
+    /// Names of all adapters, software ones too, in the order in which the drivers list them.
+    pub fn adapters() -> Vec<String> {
+        all_adapters(&instance()).iter().map(|adapter| adapter.get_info().name).collect()
+    }
+
+    /// Opens the adapter that is asked for, or the fastest there is; a software one serves when there is no other.
     pub fn open(options: &GpuOptions) -> Result<Arc<Self>, Error> {
-        let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
-            backends: wgpu::Backends::VULKAN | wgpu::Backends::METAL | wgpu::Backends::DX12,
-            flags: wgpu::InstanceFlags::empty(),
-            memory_budget_thresholds: wgpu::MemoryBudgetThresholds::default(),
-            backend_options: wgpu::BackendOptions::default(),
-            display: None,
-        });
-        let adapter = pollster::block_on(instance.request_adapter(&wgpu::RequestAdapterOptions {
-            power_preference: wgpu::PowerPreference::HighPerformance,
-            ..wgpu::RequestAdapterOptions::default()
-        }))
-        .map_err(|_| Error::NoAdapter)?;
+        let instance = instance();
+        let adapter = match options.adapter {
+            Some(ix) => {
+                let mut adapters = all_adapters(&instance);
+                if ix >= adapters.len() {
+                    return Err(Error::NoSuchAdapter { ix, n_adapters: adapters.len() });
+                }
+                adapters.swap_remove(ix)
+            }
+            None => pollster::block_on(instance.request_adapter(&wgpu::RequestAdapterOptions {
+                power_preference: wgpu::PowerPreference::HighPerformance,
+                ..wgpu::RequestAdapterOptions::default()
+            }))
+            .map_err(|_| Error::NoAdapter)?,
+        };
         let optional = Optional::of(&adapter, options);
         let mut limits = adapter.limits();
         if let Some(bytes) = options.max_binding_bytes {

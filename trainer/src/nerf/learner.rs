@@ -185,7 +185,7 @@ impl Learner {
         reference::March { step: 2.0 / f64::from(n_steps), most_samples: usize::MAX, n_cells: n_cells as usize }
     }
 
-    /// Takes note of what a depth image tells about where something is.
+    /// Takes note of what depth images tell about where something is.
     pub(crate) fn hint(&mut self, gpu: &Gpu, hints: &[u32]) -> Result<(), Error> {
         if hints.is_empty() {
             return Ok(());
@@ -240,9 +240,7 @@ impl Learner {
                     of_pixels.show(list, canvas);
                 }
                 list.submit(gpu);
-                let n_samples = gpu.read::<u32>(&batch.batch, 2)?[1];
-                log::debug!("nerf: pixel {first}: {n_samples} samples in the last round");
-                if n_samples == 0 {
+                if gpu.read::<u32>(&batch.batch, 2)?[1] == 0 {
                     break;
                 }
             }

@@ -2,6 +2,7 @@
 
 #[cfg(test)]
 mod against_twin;
+pub mod bench;
 mod buffers;
 mod carve;
 mod extent;

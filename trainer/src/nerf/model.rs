@@ -11,8 +11,8 @@ use super::sizes::Sizes;
 use crate::align::Alignment;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming, PendingRead};
-use crate::splat::{Camera, PosedLens, equirect};
-use crate::{Error, Keyframe, Method, Part, Picture, Progress, Projection, RenderRequest, Split};
+use crate::splat::{Camera, PosedLens, projections};
+use crate::{Error, Keyframe, Method, Part, Picture, Progress, RenderRequest, Split};
 use kinematics::Stamp;
 use rayon::prelude::*;
 use std::path::Path;
@@ -21,6 +21,8 @@ use std::time::Instant;
 
 /// GPU time that a submit may take, milliseconds.
 const MOST_SUBMIT_MILLIS: f64 = 20.0;
+/// Depth images whose hints lie on the GPU at once: a few megabytes.
+const DEPTHS_AT_ONCE: usize = 32;
 /// Nearest place that rays look at, in units of the scene's radius.
 const BEGIN: f32 = 0.03;
 
@@ -112,9 +114,9 @@ impl NerfModel {
         let march = learner.march();
         let depths: Vec<_> =
             self.images[self.n_hinted..].iter().filter_map(|image| image.keyframe.depth.as_ref()).collect();
-        let hints: Vec<_> = depths.par_iter().map(|depth| carve::hints(depth, extent, &march)).collect();
-        for hints in hints {
-            learner.hint(&self.gpu, &hints)?;
+        for depths in depths.chunks(DEPTHS_AT_ONCE) {
+            let hints: Vec<_> = depths.par_iter().map(|depth| carve::hints(depth, extent, &march)).collect();
+            learner.hint(&self.gpu, &hints.concat())?;
         }
         self.n_hinted = self.images.len();
         Ok(())
@@ -123,8 +125,7 @@ impl NerfModel {
     /// Waits for the submit in flight.
     fn settle(&mut self) -> Result<(), Error> {
         let Some(in_flight) = self.in_flight.take() else { return Ok(()) };
-        let batch = in_flight.batch.finish::<u32>(&self.gpu)?;
-        log::debug!("nerf: step {}: {} samples of {} rays", self.step, batch[1], batch[0]);
+        in_flight.batch.finish::<u32>(&self.gpu)?;
         let millis = in_flight.since.elapsed().as_secs_f64() * 1e3 / in_flight.n_steps.max(1) as f64;
         self.step_millis = if self.step_millis == 0.0 { millis } else { 0.8 * self.step_millis + 0.2 * millis };
         Ok(())
@@ -225,14 +226,7 @@ impl Method for NerfModel {
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         // Whoever looks must not decide with which keyframes the field begins.
         self.settle()?;
-        match request.projection {
-            Projection::Pinhole { focal_px, principal_px } => {
-                self.draw(&Camera::of_request(request, focal_px, principal_px), request.background_srgb)
-            }
-            Projection::Equirectangular => {
-                equirect::render(request, |camera| self.draw(camera, request.background_srgb))
-            }
-        }
+        projections::render(request, |camera| self.draw(camera, request.background_srgb))
     }
 
     fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {

@@ -11,7 +11,6 @@ mod camera_terms;
 #[cfg(test)]
 mod change_against_twin;
 pub mod cloud;
-pub(crate) mod equirect;
 pub mod kernels;
 #[cfg(test)]
 mod learning;
@@ -20,6 +19,7 @@ mod params;
 mod passes;
 #[cfg(test)]
 mod poison;
+pub(crate) mod projections;
 pub mod reference;
 #[cfg(test)]
 mod resuming;

@@ -19,7 +19,7 @@ use super::views::{Level, LevelImages, Order, TrainView};
 use crate::align::Alignment;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
-use crate::{Error, Keyframe, Method, Part, Picture, Progress, Projection, RenderRequest, Split, ply};
+use crate::{Error, Keyframe, Method, Part, Picture, Progress, RenderRequest, Split, ply};
 use aligning::Aligning;
 use kinematics::Stamp;
 use rayon::prelude::*;
@@ -882,15 +882,7 @@ impl Method for SplatTrainer {
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         self.seed_from_depth()?;
-        match request.projection {
-            Projection::Pinhole { focal_px, principal_px } => {
-                let camera = Camera::of_request(request, focal_px, principal_px);
-                self.draw_view(&camera, request.background_srgb)
-            }
-            Projection::Equirectangular => {
-                super::equirect::render(request, |camera| self.draw_view(camera, request.background_srgb))
-            }
-        }
+        super::projections::render(request, |camera| self.draw_view(camera, request.background_srgb))
     }
 
     fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {

@@ -16,7 +16,7 @@ use crate::align::Alignment;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming, Passes, PendingRead};
 use crate::seen::Seen;
-use crate::splat::{Camera, PosedLens};
+use crate::splat::{Camera, PosedLens, projections};
 use crate::{Error, Keyframe, Method, Part, Picture, Progress, Projection, RenderRequest, Split};
 use kinematics::Stamp;
 use std::collections::{BTreeSet, VecDeque};
@@ -390,15 +390,7 @@ impl Method for TsdfModel {
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         self.settle()?;
         self.fuse_first()?;
-        match request.projection {
-            Projection::Pinhole { focal_px, principal_px } => {
-                let camera = Camera::of_request(request, focal_px, principal_px);
-                self.draw_view(&camera, request.background_srgb)
-            }
-            Projection::Equirectangular => {
-                crate::splat::equirect::render(request, |camera| self.draw_view(camera, request.background_srgb))
-            }
-        }
+        projections::render(request, |camera| self.draw_view(camera, request.background_srgb))
     }
 
     fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {

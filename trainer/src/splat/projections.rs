@@ -1,20 +1,31 @@
-//! Pictures of all directions, put together from the six faces of a cube.
+//! Pictures of any projection from pinhole pictures: of all directions from the six faces of a cube.
 #![expect(
     clippy::cast_possible_truncation,
     reason = "pixels are rounded down on purpose, within image sizes that are u32"
 )]
 
 use super::params::{Camera, LOW_PASS_PX2};
-use crate::{Error, Picture, RenderRequest};
+use crate::{Error, Picture, Projection, RenderRequest};
 use kinematics::Transform;
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 use std::f64::consts::{FRAC_PI_2, PI};
+
+/// Draws what is asked for with `draw`, which knows pinhole cameras.
+pub(crate) fn render(
+    request: &RenderRequest,
+    mut draw: impl FnMut(&Camera) -> Result<Picture, Error>,
+) -> Result<Picture, Error> {
+    match request.projection {
+        Projection::Pinhole { focal_px, principal_px } => draw(&Camera::of_request(request, focal_px, principal_px)),
+        Projection::Equirectangular => all_directions(request, draw),
+    }
+}
 
 /// Draws the cube's faces with `draw` and looks each direction up in them.
 ///
 /// Longitude runs along x from -180 to 180 degrees, latitude along y from up to down; the camera's z axis is the middle.
 /// Depth is the distance from the camera's center, not along an axis.
-pub(crate) fn render(
+fn all_directions(
     request: &RenderRequest,
     mut draw: impl FnMut(&Camera) -> Result<Picture, Error>,
 ) -> Result<Picture, Error> {

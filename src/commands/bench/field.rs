@@ -1,0 +1,82 @@
+//! `fieldrig bench field`: how fast a neural field learns.
+
+use crate::print;
+use anyhow::Context;
+use serde::Serialize;
+use trainer::nerf::bench::time_steps;
+
+/// Samples of a step where no flag says: on a GPU, and on the CPU.
+const USUAL: [u32; 2] = [1 << 17, 1 << 18];
+const USUAL_ON_CPU: [u32; 1] = [1 << 14];
+
+/// Flags of `bench field`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Rays of a step, 1 to 65536
+    #[arg(long, value_name = "N", default_value_t = 4096, value_parser = clap::value_parser!(u32).range(1..=65_536))]
+    rays: u32,
+    /// Samples of a step, separated by commas; rounded down to a multiple of the rays, at least one each
+    /// [default: 131072,262144; without a GPU 16384]
+    #[arg(long, value_name = "N,...", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=1 << 24))]
+    samples: Vec<u32>,
+    /// Steps timed, 1 to 10000; the median counts [default: 100; without a GPU 3]
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    repeats: Option<u32>,
+    /// Print the GPU time of each pass of a step
+    #[arg(long)]
+    profile: bool,
+    /// Print one JSON object a line
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Serialize)]
+struct Row {
+    rays: u32,
+    samples: u32,
+    step_ms: f64,
+    step_wall_ms: f64,
+    peak_mb: u64,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    passes: Vec<(&'static str, f64)>,
+}
+
+pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    let is_software = crate::commands::open_gpu()?.is_software();
+    let usual: &[u32] = if is_software { &USUAL_ON_CPU } else { &USUAL };
+    let n_repeats = args.repeats.unwrap_or(if is_software { 3 } else { 100 }) as usize;
+    for (place, n_samples) in (if args.samples.is_empty() { usual } else { &args.samples }).iter().enumerate() {
+        // A fresh device for each row, so that the peak of memory is the row's own.
+        let gpu = crate::commands::open_gpu()?;
+        if place == 0 {
+            log::info!("{}", gpu.describe());
+        }
+        let n_samples = (n_samples / args.rays).max(1) * args.rays;
+        let figures = time_steps(&gpu, args.rays, n_samples, n_repeats)
+            .with_context(|| format!("{n_samples} samples: try fewer --samples"))?;
+        let row = Row {
+            rays: figures.n_rays,
+            samples: figures.n_samples,
+            step_ms: figures.step_millis,
+            step_wall_ms: figures.step_wall_millis,
+            peak_mb: figures.peak_bytes >> 20,
+            passes: if args.profile {
+                figures.passes.iter().map(|pass| (pass.name, pass.millis)).collect()
+            } else {
+                Vec::new()
+            },
+        };
+        if args.json {
+            print::json(&row)?;
+            continue;
+        }
+        print::line(format_args!(
+            "{} rays {:>8} samples: step {:.3} ms (wall {:.3}), peak {} MB",
+            row.rays, row.samples, row.step_ms, row.step_wall_ms, row.peak_mb
+        ))?;
+        for (name, millis) in &row.passes {
+            print::line(format_args!("    {millis:>9.4} ms  {name}"))?;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,126 @@
+//! Times a step of learning on synthetic rays, pass by pass.
+//!
+//! Rays begin anywhere in a cube that is occupied throughout and are all equally long, so that a step has a known number of
+//! samples; their colors are noise. The occupancy is not visited.
+
+use super::learner::{Learner, STEPS_PER_SUBMIT};
+use super::options::{Effort, NerfOptions};
+use super::params::Ray;
+use super::rays::{mixed, unit};
+use super::reference::grid::GridShape;
+use super::sizes::Sizes;
+use crate::Error;
+use crate::gpu::{Gpu, PassTiming, f32_of, f32s_of};
+use nalgebra::Vector3;
+use std::time::Instant;
+
+/// Levels, coarsest and finest cells along an axis, and the logarithm of the entries of a level: as Mueller et al. 2022 have it.
+const GRID: (u32, u32, u32, u32) = (16, 16, 2048, 19);
+/// No multiple of the steps between two visits of the occupancy.
+const STEP: u64 = 1;
+
+/// Figures of one number of samples.
+#[derive(Clone, Debug)]
+pub struct StepFigures {
+    /// Rays of a step.
+    pub n_rays: u32,
+    /// Samples of a step.
+    pub n_samples: u32,
+    /// GPU time of a step, milliseconds: the sum over its passes, median; wall time where there are no timestamps.
+    pub step_millis: f64,
+    /// Wall time of a step, mean of a row of them back to back, milliseconds.
+    pub step_wall_millis: f64,
+    /// GPU time of each pass of one step; empty without timestamps.
+    pub passes: Vec<PassTiming>,
+    /// Most bytes of GPU buffers alive at once.
+    pub peak_bytes: u64,
+}
+
+/// Times steps of `n_rays` rays with `n_samples` samples in all, a multiple of them.
+pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> Result<StepFigures, Error> {
+    let options = NerfOptions::default();
+    let effort = Effort { n_rays, n_samples, ..Effort::FULL };
+    let (n_levels, coarsest, finest, log2_entries) = GRID;
+    let shape = GridShape::between(coarsest, finest, n_levels, log2_entries);
+    let sizes = Sizes { n_cells: shape.n_cells, log2_entries, n_codes: 1, has_depth: false, effort };
+    let mut learner = Learner::new(gpu, &options, sizes)?;
+    let rays = synthetic_rays(effort);
+    let submit = |learner: &mut Learner, n_steps: usize| {
+        for slot_ix in 0..n_steps {
+            learner.record_step(gpu, &options, slot_ix, STEP, &rays)?;
+        }
+        Ok(learner.submit(gpu))
+    };
+    submit(&mut learner, STEPS_PER_SUBMIT)?.finish::<u32>(gpu)?;
+    let n_submits = n_repeats.div_ceil(STEPS_PER_SUBMIT);
+    let since = Instant::now();
+    let mut before = None;
+    for _ in 0..n_submits {
+        // As in learning, the next submit is made while one runs.
+        if let Some(before) = before.replace(submit(&mut learner, STEPS_PER_SUBMIT)?) {
+            before.finish::<u32>(gpu)?;
+        }
+    }
+    let taken = match before {
+        Some(last) => last.finish::<u32>(gpu)?,
+        None => Vec::new(),
+    };
+    let step_wall_millis = since.elapsed().as_secs_f64() * 1e3 / (n_submits * STEPS_PER_SUBMIT) as f64;
+    let mut timed = Vec::new();
+    for _ in 0..n_repeats.max(1) {
+        learner.record_step(gpu, &options, 0, STEP, &rays)?;
+        let since = Instant::now();
+        let passes = learner.submit_timed(gpu)?;
+        let wall = since.elapsed().as_secs_f64() * 1e3;
+        let sum = if passes.is_empty() { wall } else { passes.iter().map(|pass| pass.millis).sum() };
+        timed.push((sum, passes));
+    }
+    timed.sort_by(|(a, _), (b, _)| a.total_cmp(b));
+    let (step_millis, passes) = timed.swap_remove(timed.len() / 2);
+    Ok(StepFigures {
+        n_rays,
+        n_samples: taken.get(1).copied().unwrap_or(0),
+        step_millis,
+        step_wall_millis,
+        passes,
+        peak_bytes: gpu.peak_bytes(),
+    })
+}
+
+/// Rays with equally many samples, filling the batch.
+fn synthetic_rays(effort: Effort) -> Vec<Ray> {
+    let Effort { n_rays, n_samples, n_steps, .. } = effort;
+    // Half a step to spare, so that rounding decides nothing.
+    let length = 2.0 / f64::from(n_steps) * (f64::from(n_samples / n_rays) - 0.5);
+    let ray = |ix: u32| {
+        let number = |stream: u64| 2.0 * unit(mixed(u64::from(ix) << 8 | stream)) - 1.0;
+        let triple = |stream: u64| Vector3::from_fn(|axis, _| number(stream + axis as u64));
+        let direction = triple(0).normalize();
+        // Its middle in the cube, and all of it where steps are even.
+        let origin = (triple(3) * 0.5).map(|along| along.clamp(-0.5, 0.5)) - 0.5 * length * direction;
+        let target = mixed(u64::from(ix) << 8 | 6).to_le_bytes();
+        Ray {
+            origin: f32s_of(origin.into()),
+            direction: f32s_of(direction.into()),
+            begin: 0.0,
+            end: f32_of(length),
+            target_rgb: u32::from_le_bytes([target[0], target[1], target[2], 255]),
+            ..Ray::default()
+        }
+    };
+    (0..n_rays).map(ray).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::GpuOptions;
+
+    #[test]
+    fn a_timed_step_has_as_many_samples_as_it_says() {
+        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let figures = time_steps(&gpu, 64, 512, 1).unwrap();
+        assert_eq!(figures.n_samples, 512);
+        assert!(figures.step_millis > 0.0 && figures.step_wall_millis > 0.0);
+    }
+}
