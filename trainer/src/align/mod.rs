@@ -78,17 +78,20 @@ pub fn candidates() -> Vec<TermSet> {
 pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraChoice) -> Option<Alignment> {
     let scene = Scene::new(keyframes, wants_poses(choice))?;
     let nothing = Model { set: TermSet::default(), fit: None, corrections: Corrections::none(scene.cameras.len()) };
-    let mut trials = Vec::new();
+    let (mut trials, mut unseen) = (Vec::new(), Vec::new());
     let kept = match choice {
         CameraChoice::Given(set) => {
             let with = scene.model(*set, &nothing)?;
             trials.push(scene.judge(*set, &nothing, &with));
             with
         }
-        CameraChoice::Try(candidates) => scene.choose(candidates, nothing, &mut trials),
+        CameraChoice::Try(candidates) => scene.choose(candidates, nothing, &mut trials, &mut unseen),
     };
+    if let Some(fit) = &kept.fit {
+        unseen.extend(report::unseen(&scene, fit));
+    }
     let kept = if kept.set.image_poses { scene.with_judges(kept) } else { kept };
-    Some(report::alignment(&scene, &kept, trials))
+    Some(report::alignment(&scene, &kept, trials, unseen))
 }
 
 fn wants_poses(choice: &CameraChoice) -> bool {
@@ -179,7 +182,15 @@ impl Scene {
     }
 
     /// Adds one candidate after the other where it pays, then takes away what no longer does.
-    fn choose(&self, candidates: &[TermSet], nothing: Model, trials: &mut Vec<Trial>) -> Model {
+    ///
+    /// A hand-eye transform that is not corrected may be wrong all the same where the motion does not show it: that is added to `unseen`.
+    fn choose(
+        &self,
+        candidates: &[TermSet],
+        nothing: Model,
+        trials: &mut Vec<Trial>,
+        unseen: &mut Vec<Unseen>,
+    ) -> Model {
         let mut kept = nothing;
         let mut parts: Vec<TermSet> = Vec::new();
         for candidate in candidates {
@@ -193,6 +204,8 @@ impl Scene {
             if trial.kept {
                 parts.push(*candidate);
                 kept = with;
+            } else if candidate.mount {
+                unseen.extend(with.fit.iter().flat_map(|fit| report::unseen(self, fit)));
             }
             trials.push(trial);
         }

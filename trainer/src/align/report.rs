@@ -1,5 +1,6 @@
 //! What alignment found, in words and numbers a person can use.
 
+use super::fit::Fit;
 use super::layout::Term;
 use super::solve::Solved;
 use super::{LEAST_JUDGES, Model, Scene};
@@ -111,16 +112,12 @@ pub struct Unseen {
     pub parts: Vec<String>,
 }
 
-pub(super) fn alignment(scene: &Scene, kept: &Model, trials: Vec<Trial>) -> Alignment {
+pub(super) fn alignment(scene: &Scene, kept: &Model, trials: Vec<Trial>, unseen: Vec<Unseen>) -> Alignment {
     let mut found = Vec::new();
-    let mut unseen = Vec::new();
     if let Some(fit) = &kept.fit {
         for (ix, term) in fit.layout.terms.iter().enumerate() {
             found.extend(self::found(scene, kept, &fit.solved, ix, *term));
         }
-        let carries_way = |ix: usize| !matches!(fit.layout.terms[ix], Term::Mount(_, 0..3) | Term::DepthPose(_, 0..3));
-        let directions = fit.solved.unseen(carries_way);
-        unseen.extend(directions.iter().map(|direction| self::unseen(scene, &fit.layout.terms, direction)));
     }
     if kept.set.image_poses {
         found.extend(scene.cameras.iter().enumerate().map(|(camera, name)| {
@@ -183,7 +180,14 @@ fn moved(camera: String, turn: Vector3<f64>, shift: Vector3<f64>, solved: &Solve
     Moved { camera, turn_rad, turn_sigma_rad, turn_axis, shift_m, shift_sigma_m, shift_axis }
 }
 
-fn unseen(scene: &Scene, terms: &[Term], direction: &DVector<f64>) -> Unseen {
+/// Directions that a fit cannot tell.
+pub(super) fn unseen(scene: &Scene, fit: &Fit) -> Vec<Unseen> {
+    let carries_way = |ix: usize| !matches!(fit.layout.terms[ix], Term::Mount(_, 0..3) | Term::DepthPose(_, 0..3));
+    let directions = fit.solved.unseen(carries_way);
+    directions.iter().map(|direction| named(scene, &fit.layout.terms, direction)).collect()
+}
+
+fn named(scene: &Scene, terms: &[Term], direction: &DVector<f64>) -> Unseen {
     /// Parts below this share of the largest are left out.
     const SMALL: f64 = 0.1;
     let scaled: Vec<f64> = terms.iter().enumerate().map(|(ix, term)| direction[ix] / term.scale()).collect();

@@ -281,6 +281,15 @@ fn a_wrong_readout_is_found() {
 }
 
 #[test]
+fn what_a_motion_does_not_show_of_a_mount_is_told_where_the_mount_is_right_too() {
+    let alignment = tried(&Wrong { azimuth_only: true, ..Wrong::nothing() });
+    assert!(!alignment.is_any(), "{alignment:?}");
+    let parts: Vec<_> = alignment.unseen.iter().flat_map(|unseen| &unseen.parts).collect();
+    assert!(parts.iter().any(|part| part.starts_with("translation of camera \"wrist\" along")), "{parts:?}");
+    assert!(tried(&Wrong::nothing()).unseen.is_empty(), "a full motion shows all");
+}
+
+#[test]
 fn a_turn_about_one_axis_does_not_show_all_of_a_mount() {
     let wrong = Wrong { mount: wrong_mount(), azimuth_only: true, ..Wrong::nothing() };
     let alignment = given(&wrong, |set| set.mount = true);
