@@ -3,6 +3,7 @@
 use super::{Buffer, Gpu, Pipeline};
 use crate::Error;
 use std::collections::HashMap;
+use std::ops::Range;
 
 /// Most workgroups WebGPU allows along one axis.
 const MAX_GROUPS_PER_AXIS: u64 = 65_535;
@@ -18,7 +19,7 @@ pub struct PassTiming {
 
 enum Pass {
     Dispatch { pipeline: wgpu::ComputePipeline, bind_group: wgpu::BindGroup, groups: [u32; 2], name: &'static str },
-    Clear { buffer: wgpu::Buffer },
+    Clear { buffer: wgpu::Buffer, bytes: Range<u64> },
 }
 
 /// A list of GPU passes; listing them does not touch the GPU.
@@ -87,7 +88,12 @@ impl Passes {
 
     /// Adds the zeroing of a buffer.
     pub fn clear(&mut self, buffer: &Buffer) {
-        self.list.push(Pass::Clear { buffer: buffer.raw.clone() });
+        self.clear_range(buffer, 0..buffer.bytes());
+    }
+
+    /// Adds the zeroing of a part of a buffer; begin and end are multiples of 4.
+    pub fn clear_range(&mut self, buffer: &Buffer, bytes: Range<u64>) {
+        self.list.push(Pass::Clear { buffer: buffer.raw.clone(), bytes });
     }
 
     /// Number of passes listed.
@@ -171,7 +177,9 @@ impl Passes {
         let mut names = Vec::new();
         for pass in self.list.drain(..) {
             match &pass {
-                Pass::Clear { buffer } => encoder.clear_buffer(buffer, 0, None),
+                Pass::Clear { buffer, bytes } => {
+                    encoder.clear_buffer(buffer, bytes.start, Some(bytes.end - bytes.start))
+                }
                 Pass::Dispatch { name, .. } => {
                     let ix = u32_of(names.len() as u64);
                     let mut compute = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
@@ -217,7 +225,7 @@ fn encode_all(encoder: &mut wgpu::CommandEncoder, list: impl Iterator<Item = Pas
     let mut passes = list.peekable();
     while let Some(pass) = passes.next() {
         match pass {
-            Pass::Clear { buffer } => encoder.clear_buffer(&buffer, 0, None),
+            Pass::Clear { buffer, bytes } => encoder.clear_buffer(&buffer, bytes.start, Some(bytes.end - bytes.start)),
             first @ Pass::Dispatch { .. } => {
                 let mut compute = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
                 encode(&mut compute, &first);

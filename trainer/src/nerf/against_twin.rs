@@ -1,7 +1,7 @@
 //! The kernels against their twins in f64.
 
-use super::buffers::{BatchBuffers, FieldBuffers, FieldMoments, FieldSlopes, RaySlot};
-use super::kernels::{FieldPipelines, KERNELS, Widths};
+use super::buffers::{FieldBuffers, FieldMoments, FieldSlopes, RaySlot, SampleBuffers, StepBuffers};
+use super::kernels::{FieldPipelines, KERNELS, N_CHUNK, Widths};
 use super::params::{self, Batch, LearnRule, Level, RayLoss, Span};
 use super::passes::FieldPasses;
 use super::reference::field::{Field, FieldGrad};
@@ -9,7 +9,7 @@ use super::reference::network::Network;
 use super::reference::ray as reference;
 use super::reference::scene::{N_CODE, Ray, WEIGHTS, field, gradient, ray, samples};
 use super::reference::space::contract;
-use crate::gpu::{Buffer, Gpu, GpuOptions, Passes, f32_of, f32s_of, reflect, resolve};
+use crate::gpu::{Gpu, GpuOptions, Passes, f32_of, f32s_of, reflect, resolve};
 use crate::mismatches::Mismatches;
 use crate::optim::reference::{Adam, Moments};
 
@@ -27,36 +27,51 @@ fn padded(weights: &[f64], [n_in, n_out]: [usize; 2], [n_in_padded, n_out_padded
     padded
 }
 
-fn fill(gpu: &Gpu, buffers: &[Buffer], network: &Network, widths: &[u32]) {
-    let mut begin = 0;
-    for (ix, pair) in network.sizes.windows(2).enumerate() {
-        let end = begin + pair[0] * pair[1];
-        let layer = padded(&network.weights[begin..end], [pair[0], pair[1]], [widths[ix], widths[ix + 1]]);
-        gpu.write(&buffers[ix], 0, bytemuck::cast_slice(&layer));
-        begin = end;
+/// Sizes of the layers of both networks, and those of the kernels.
+fn layers<'a>(twin: &'a Field, widths: &Widths) -> impl Iterator<Item = ([usize; 2], [u32; 2])> + use<'a> {
+    let of = |network: &'a Network| network.sizes.windows(2).map(|pair| [pair[0], pair[1]]);
+    of(&twin.density).chain(of(&twin.color)).zip(widths.layers())
+}
+
+/// Weights of both networks as the kernels have them.
+fn weights(twin: &Field, widths: &Widths) -> Vec<f32> {
+    let mut rest = &[&twin.density.weights[..], &twin.color.weights].concat()[..];
+    let mut all = Vec::new();
+    for (sizes, widths) in layers(twin, widths) {
+        let (layer, others) = rest.split_at(sizes[0] * sizes[1]);
+        all.extend(padded(layer, sizes, widths));
+        rest = others;
+    }
+    all
+}
+
+/// Compares weights, or slopes towards them, those of both networks one after the other; those of the padding are zero.
+fn check_weights(wrong: &mut Mismatches, got: &[f32], twin: &Field, widths: &Widths, expected: &[f64], abs: [f64; 2]) {
+    let (mut got, mut expected) = (got, expected);
+    for (layer, ([n_in, n_out], [n_in_padded, n_out_padded])) in layers(twin, widths).enumerate() {
+        let (here, others) = got.split_at((n_in_padded * n_out_padded) as usize);
+        for (at, got) in here.iter().enumerate() {
+            let (row, column) = (at / n_in_padded as usize, at % n_in_padded as usize);
+            let is_real = row < n_out && column < n_in;
+            let expected = if is_real { expected[row * n_in + column] } else { 0.0 };
+            wrong.check(
+                format!("layer {layer}: {row} {column}"),
+                (*got).into(),
+                expected,
+                abs[usize::from(layer > 1)],
+                1e-4,
+            );
+        }
+        (got, expected) = (others, &expected[n_in * n_out..]);
     }
 }
 
-/// Compares slopes towards weights, and that those of the padding are zero.
-fn check_weights(
-    wrong: &mut Mismatches,
-    (name, gpu, buffers): (&str, &Gpu, &[Buffer]),
-    (sizes, widths): (&[usize], &[u32]),
-    expected: &[f64],
-    abs: f64,
-) {
-    let mut begin = 0;
-    for (ix, pair) in sizes.windows(2).enumerate() {
-        let (n_in, n_in_padded) = (pair[0], widths[ix] as usize);
-        let got: Vec<f32> = gpu.read(&buffers[ix], n_in_padded * widths[ix + 1] as usize).unwrap();
-        for (at, got) in got.into_iter().enumerate() {
-            let (row, column) = (at / n_in_padded, at % n_in_padded);
-            let is_real = row < pair[1] && column < n_in;
-            let expected = if is_real { expected[begin + row * n_in + column] } else { 0.0 };
-            wrong.check(format!("{name} {ix}: {row} {column}"), got.into(), expected, abs, 1e-4);
-        }
-        begin += n_in * pair[1];
-    }
+/// Slopes towards weights, summed over the chunks of samples.
+fn summed(gpu: &Gpu, step: &StepBuffers, widths: &Widths, n_samples: u32) -> Vec<f32> {
+    let n_weights = widths.n_weights() as usize;
+    let n_chunks = n_samples.div_ceil(N_CHUNK) as usize;
+    let partial: Vec<f32> = gpu.read(&step.partial_sums, n_chunks * n_weights).unwrap();
+    (0..n_weights).map(|ix| partial.iter().skip(ix).step_by(n_weights).sum()).collect()
 }
 
 fn largest_of(values: &[f64]) -> f64 {
@@ -68,7 +83,8 @@ struct Bench {
     pipelines: FieldPipelines,
     widths: Widths,
     field: FieldBuffers,
-    batch: BatchBuffers,
+    samples: SampleBuffers,
+    step: StepBuffers,
     slopes: FieldSlopes,
     slot: RaySlot,
 }
@@ -81,11 +97,11 @@ fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Be
     let field = FieldBuffers::new(&gpu, &twin.shape, &widths, n_rays).unwrap();
     let entries: Vec<[f32; 2]> = twin.table.iter().map(|entry| f32s_of(*entry)).collect();
     gpu.write(&field.grid, 0, bytemuck::cast_slice(&entries));
-    fill(&gpu, &field.density, &twin.density, &widths.density);
-    fill(&gpu, &field.color, &twin.color, &widths.color);
+    gpu.write(&field.weights, 0, bytemuck::cast_slice(&weights(twin, &widths)));
     // Room for more than there are.
-    let batch = BatchBuffers::new(&gpu, &widths, n_rays + 3, n_samples + 600).unwrap();
-    gpu.write(&batch.batch, 0, bytemuck::bytes_of(&Batch { n_samples, ..Batch::of(n_rays) }));
+    let samples = SampleBuffers::new(&gpu, n_samples + 600).unwrap();
+    let step = StepBuffers::new(&gpu, &widths, n_rays + 3, n_samples + 600).unwrap();
+    gpu.write(&samples.batch, 0, bytemuck::bytes_of(&Batch { n_samples, ..Batch::of(n_rays) }));
     let (mut gpu_rays, mut spans, mut points, mut codes) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for (ray, code) in rays.iter().zip(0..) {
         let byte = |value: f64| u32::from(format!("{:.0}", 255.0 * value).parse::<u8>().unwrap());
@@ -112,10 +128,10 @@ fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Be
     }
     let slot = RaySlot::new(&gpu, n_rays + 3).unwrap();
     gpu.write(&slot.rays, 0, bytemuck::cast_slice(&gpu_rays));
-    gpu.write(&batch.points, 0, bytemuck::cast_slice(&points));
-    gpu.write(&batch.spans, 0, bytemuck::cast_slice(&spans));
+    gpu.write(&samples.points, 0, bytemuck::cast_slice(&points));
+    gpu.write(&samples.spans, 0, bytemuck::cast_slice(&spans));
     gpu.write(&field.codes, 0, bytemuck::cast_slice(&codes));
-    let slopes = FieldSlopes::new(&gpu, &twin.shape, &widths).unwrap();
+    let slopes = FieldSlopes::new(&gpu, &twin.shape).unwrap();
     gpu.write(&slopes.scales, 0, bytemuck::cast_slice(scales));
     let loss = RayLoss {
         background_srgb: [0, 1, 2, 0].map(|channel| f32_of(WEIGHTS.background_rgb[channel])),
@@ -134,7 +150,8 @@ fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Be
         gpu,
         widths,
         field,
-        batch,
+        samples,
+        step,
         slopes,
         slot,
     }
@@ -170,16 +187,16 @@ fn pictures_and_gradients_match_the_twin() {
     let scale = f32_of((2f64.powi(28) / largest).log2().floor().exp2());
     for options in forms() {
         let bench = bench(&options, &twin, &rays, &vec![scale; twin.shape.n_cells.len()]);
-        let Bench { gpu, pipelines, widths, field, batch, slopes, slot } = &bench;
-        let passes = FieldPasses { gpu, pipelines, field, batch, slot };
+        let Bench { gpu, pipelines, widths, field, samples: batch, step, slopes, slot } = &bench;
+        let passes = FieldPasses { gpu, pipelines, field, samples: batch, slot };
         let mut list = Passes::default();
-        passes.forward(&mut list);
-        passes.backward(&mut list, slopes);
+        passes.forward(&mut list, step);
+        passes.backward(&mut list, step, slopes);
         list.submit(gpu);
 
         let mut wrong = Mismatches::default();
-        let seen: Vec<[f32; 4]> = gpu.read(&batch.seen, rays.len()).unwrap();
-        let errors: Vec<[f32; 2]> = gpu.read(&batch.ray_errors, rays.len()).unwrap();
+        let seen: Vec<[f32; 4]> = gpu.read(&step.seen, rays.len()).unwrap();
+        let errors: Vec<[f32; 2]> = gpu.read(&step.ray_errors, rays.len()).unwrap();
         for (ix, ray) in rays.iter().enumerate() {
             let picture = reference::composite(&samples(&twin, ray));
             for (channel, (got, expected)) in seen[ix].iter().zip(picture.rgb).enumerate() {
@@ -188,20 +205,11 @@ fn pictures_and_gradients_match_the_twin() {
             wrong.check(format!("transmittance {ix}"), seen[ix][3].into(), picture.transmittance, 1e-5, 1e-5);
             wrong.check(format!("distance {ix}"), errors[ix][1].into(), picture.distance, 1e-5, 1e-5);
         }
-        check_weights(
-            &mut wrong,
-            ("density", gpu, &slopes.density),
-            (&twin.density.sizes, &widths.density),
-            &expected.density,
-            2e-5 * largest_of(&expected.density),
-        );
-        check_weights(
-            &mut wrong,
-            ("color", gpu, &slopes.color),
-            (&twin.color.sizes, &widths.color),
-            &expected.color,
-            2e-5 * largest_of(&expected.color),
-        );
+        let n_samples = gpu.read::<u32>(&batch.batch, 2).unwrap()[1];
+        let got = summed(gpu, step, widths, n_samples);
+        let of_weights = [&expected.density[..], &expected.color].concat();
+        let abs = [&expected.density, &expected.color].map(|slopes| 2e-5 * largest_of(slopes));
+        check_weights(&mut wrong, &got, &twin, widths, &of_weights, abs);
         let got: Vec<i32> = gpu.read(&slopes.grid, 2 * twin.table.len()).unwrap();
         for (ix, (got, expected)) in got.iter().zip(expected.table.as_flattened()).enumerate() {
             wrong.check(format!("entry {ix}"), f64::from(*got) / f64::from(scale), *expected, 2e-5 * largest, 1e-4);
@@ -229,19 +237,19 @@ fn steps_of_learning_match_the_twin() {
     let of_weights = LearnRule { rate: 0.01, pull: 0.5, ..of_grid };
     let first_scale = 2f32.powi(28); // Fine enough for the first step; the others find their own.
     let bench = bench(&GpuOptions::default(), &twin, &rays, &vec![first_scale; twin.shape.n_cells.len()]);
-    let Bench { gpu, pipelines, widths, field: buffers, batch, slopes, slot } = &bench;
+    let Bench { gpu, pipelines, widths, field: buffers, samples, step: kept_step, slopes, slot } = &bench;
     let moments = FieldMoments::new(gpu, &twin.shape, widths, &of_grid).unwrap();
     let rules = [gpu.uniform_with("rule", &of_grid), gpu.uniform_with("rule", &of_weights)];
-    let passes = FieldPasses { gpu, pipelines, field: buffers, batch, slot };
+    let passes = FieldPasses { gpu, pipelines, field: buffers, samples, slot };
     let adam = Adam { beta1: 0.75, beta2: 0.875, epsilon: f64::from(of_grid.epsilon) };
     let mut kept_table = vec![[Moments::default(); 2]; twin.table.len()];
     let mut kept =
         [vec![Moments::default(); twin.density.weights.len()], vec![Moments::default(); twin.color.weights.len()]];
     for step in 0..N_STEPS {
         let mut list = Passes::default();
-        passes.forward(&mut list);
-        passes.backward(&mut list, slopes);
-        passes.learn(&mut list, [&rules[0], &rules[1]], slopes, &moments);
+        passes.forward(&mut list, kept_step);
+        passes.backward(&mut list, kept_step, slopes);
+        passes.learn(&mut list, [&rules[0], &rules[1]], kept_step, slopes, &moments);
         list.submit(gpu);
 
         let gradient = expected(&twin, &rays);
@@ -267,12 +275,9 @@ fn steps_of_learning_match_the_twin() {
     for (ix, (got, expected)) in got.as_flattened().iter().zip(twin.table.as_flattened()).enumerate() {
         wrong.check(format!("entry {ix}"), (*got).into(), *expected, 4e-4, 1e-4);
     }
-    for (name, buffers, network, widths) in [
-        ("density", &buffers.density, &twin.density, &widths.density),
-        ("color", &buffers.color, &twin.color, &widths.color),
-    ] {
-        check_weights(&mut wrong, (name, gpu, buffers), (&network.sizes, widths), &network.weights, 4e-4);
-    }
+    let got: Vec<f32> = gpu.read(&buffers.weights, widths.n_weights() as usize).unwrap();
+    let of_weights = [&twin.density.weights[..], &twin.color.weights].concat();
+    check_weights(&mut wrong, &got, &twin, widths, &of_weights, [4e-4; 2]);
     wrong.assert_none();
     assert_eq!(gpu.read::<u32>(&moments.steps, 1).unwrap(), [N_STEPS]);
     assert!(gpu.read::<i32>(&slopes.grid, 2 * twin.table.len()).unwrap().iter().all(|sum| *sum == 0));
@@ -286,11 +291,11 @@ fn steps_of_learning_match_the_twin() {
 fn slopes_too_large_for_their_scale_are_counted_and_left_out() {
     let (twin, rays) = (field(7), rays());
     let bench = bench(&GpuOptions::default(), &twin, &rays, &vec![f32::MAX; twin.shape.n_cells.len()]);
-    let Bench { gpu, pipelines, field, batch, slopes, slot, .. } = &bench;
+    let Bench { gpu, pipelines, field, samples, step, slopes, slot, .. } = &bench;
     let mut list = Passes::default();
-    let passes = FieldPasses { gpu, pipelines, field, batch, slot };
-    passes.forward(&mut list);
-    passes.backward(&mut list, slopes);
+    let passes = FieldPasses { gpu, pipelines, field, samples, slot };
+    passes.forward(&mut list, step);
+    passes.backward(&mut list, step, slopes);
     list.submit(gpu);
     let n_lost = gpu.read::<u32>(&slopes.counts, 1).unwrap()[0];
     assert!(n_lost > N_RAYS * 7 * 8, "only {n_lost}");

@@ -1,13 +1,10 @@
 //! What the field and its samples take on the GPU.
 
-use super::kernels::{N_CHUNK, Widths};
+use super::kernels::{N_CHUNK, N_TILE, Widths};
 use super::params::{Batch, LearnRule, Level, March, Ray, RayLoss, Visit, levels};
 use super::reference::grid::GridShape;
 use crate::Error;
 use crate::gpu::{Buffer, Gpu};
-
-/// Weights of a network, layer by layer, `[outputs, inputs]` each; or slopes towards them.
-pub(crate) type Weights = Vec<Buffer>;
 
 /// All that is learned.
 #[derive(Debug)]
@@ -15,15 +12,16 @@ pub(crate) struct FieldBuffers {
     pub(crate) levels: Buffer,
     /// Two f32 an entry.
     pub(crate) grid: Buffer,
-    pub(crate) density: Weights,
-    pub(crate) color: Weights,
+    /// Of all layers of both networks, `[outputs, inputs]` each.
+    pub(crate) weights: Buffer,
     /// `[n_codes, n_code]`.
     pub(crate) codes: Buffer,
-    pub(crate) n_levels: u32,
+    /// What kernels bind and do not use.
+    pub(crate) nothing: Buffer,
     pub(crate) n_entries: u32,
 }
 
-/// Slopes towards all that is learned.
+/// Slopes towards the grid.
 #[derive(Debug)]
 pub(crate) struct FieldSlopes {
     /// Two i32 an entry, times the scale of its level.
@@ -32,8 +30,6 @@ pub(crate) struct FieldSlopes {
     pub(crate) scales: Buffer,
     /// How many contributions were too large for their scale: in this step, and in those before.
     pub(crate) counts: Buffer,
-    pub(crate) density: Weights,
-    pub(crate) color: Weights,
 }
 
 /// What the optimiser keeps.
@@ -41,9 +37,8 @@ pub(crate) struct FieldSlopes {
 pub(crate) struct FieldMoments {
     /// Four f32 an entry: first and second of both numbers.
     pub(crate) grid: Buffer,
-    /// Two f32 a weight.
-    pub(crate) density: Weights,
-    pub(crate) color: Weights,
+    /// Eight f32 for four weights: first of all, second of all.
+    pub(crate) weights: Buffer,
     /// Largest sum of slopes of each level.
     pub(crate) largest: Buffer,
     /// Steps so far, and visits of cells so far.
@@ -106,28 +101,34 @@ impl RaySlot {
     }
 }
 
-/// The samples of rays, and what is worked out of them.
+/// The samples of rays, and what they look like.
 #[derive(Debug)]
-pub(crate) struct BatchBuffers {
+pub(crate) struct SampleBuffers {
+    /// Most samples.
     pub(crate) n_samples: u32,
     pub(crate) batch: Buffer,
     pub(crate) spans: Buffer,
     /// Middles of the samples in the unit cube, four f32 each.
     pub(crate) points: Buffer,
-    /// What the density's network is given, and what each of its layers holds.
-    pub(crate) density: Vec<Buffer>,
-    pub(crate) color: Vec<Buffer>,
-    pub(crate) v_density: Vec<Buffer>,
-    pub(crate) v_color: Vec<Buffer>,
-    pub(crate) v_log_density: Buffer,
-    pub(crate) seen: Buffer,
-    pub(crate) ray_errors: Buffer,
-    pub(crate) partial_density: Vec<Buffer>,
-    pub(crate) partial_color: Vec<Buffer>,
+    /// Logarithms of the densities.
+    pub(crate) told: Buffer,
+    /// Before the sigmoid, four f32 each.
+    pub(crate) colors: Buffer,
 }
 
-fn weights(gpu: &Gpu, name: &str, widths: &[u32]) -> Result<Weights, Error> {
-    widths.windows(2).map(|pair| gpu.storage(name, 4 * u64::from(pair[0]) * u64::from(pair[1]))).collect()
+/// What a step keeps of its samples and rays.
+#[derive(Debug)]
+pub(crate) struct StepBuffers {
+    /// What goes into each layer.
+    pub(crate) held: Buffer,
+    /// Slopes towards what comes out of each layer.
+    pub(crate) v_held: Buffer,
+    pub(crate) v_log_density: Buffer,
+    pub(crate) v_colors: Buffer,
+    pub(crate) seen: Buffer,
+    pub(crate) ray_errors: Buffer,
+    /// Slopes towards the weights, of each chunk of samples.
+    pub(crate) partial_sums: Buffer,
 }
 
 impl FieldBuffers {
@@ -137,36 +138,29 @@ impl FieldBuffers {
         Ok(Self {
             levels: gpu.storage_with("nerf.levels", bytemuck::cast_slice(&levels))?,
             grid: gpu.storage("nerf.grid", 8 * u64::from(shape.n_entries_in_all()))?,
-            density: weights(gpu, "nerf.density", &widths.density)?,
-            color: weights(gpu, "nerf.color", &widths.color)?,
+            weights: gpu.storage("nerf.weights", 4 * u64::from(widths.n_weights()))?,
+            nothing: gpu.storage("nerf.nothing", 16)?,
             codes: gpu.storage("nerf.codes", 4 * u64::from(n_codes.max(1)) * u64::from(widths.n_code.max(1)))?,
-            n_levels: u32::try_from(levels.len()).expect("a few levels"),
             n_entries: shape.n_entries_in_all(),
         })
     }
 }
 
 impl FieldSlopes {
-    pub(crate) fn new(gpu: &Gpu, shape: &GridShape, widths: &Widths) -> Result<Self, Error> {
+    pub(crate) fn new(gpu: &Gpu, shape: &GridShape) -> Result<Self, Error> {
         Ok(Self {
             grid: gpu.storage("nerf.v_grid", 8 * u64::from(shape.n_entries_in_all()))?,
             scales: gpu.storage("nerf.scales", 4 * shape.n_cells.len() as u64)?,
             counts: gpu.storage("nerf.counts", 8)?,
-            density: weights(gpu, "nerf.v_density_weights", &widths.density)?,
-            color: weights(gpu, "nerf.v_color_weights", &widths.color)?,
         })
     }
 }
 
 impl FieldMoments {
     pub(crate) fn new(gpu: &Gpu, shape: &GridShape, widths: &Widths, rule: &LearnRule) -> Result<Self, Error> {
-        let pairs = |name: &str, widths: &[u32]| -> Result<Weights, Error> {
-            widths.windows(2).map(|pair| gpu.storage(name, 8 * u64::from(pair[0]) * u64::from(pair[1]))).collect()
-        };
         Ok(Self {
             grid: gpu.storage("nerf.grid_moments", 16 * u64::from(shape.n_entries_in_all()))?,
-            density: pairs("nerf.density_moments", &widths.density)?,
-            color: pairs("nerf.color_moments", &widths.color)?,
+            weights: gpu.storage("nerf.weight_moments", 8 * u64::from(widths.n_weights()))?,
             largest: gpu.storage("nerf.largest", 4 * shape.n_cells.len() as u64)?,
             steps: gpu.storage("nerf.steps", 8)?,
             pace: gpu.storage_with("nerf.pace", bytemuck::bytes_of(&rule.first_pace()))?,
@@ -174,31 +168,34 @@ impl FieldMoments {
     }
 }
 
-impl BatchBuffers {
-    /// Room for so many rays and samples.
-    pub(crate) fn new(gpu: &Gpu, widths: &Widths, n_rays: u32, n_samples: u32) -> Result<Self, Error> {
-        let floats = |name: &str, n_rows: u32, width: u32| gpu.storage(name, 4 * u64::from(n_rows) * u64::from(width));
-        let layers = |name: &str, widths: &[u32]| -> Result<Vec<Buffer>, Error> {
-            widths.iter().map(|width| floats(name, n_samples, *width)).collect()
-        };
-        let n_chunks = n_samples.div_ceil(N_CHUNK);
-        let partial_sums = |widths: &[u32]| -> Result<Vec<Buffer>, Error> {
-            widths.windows(2).map(|pair| floats("nerf.partial_sums", n_chunks, pair[0] * pair[1])).collect()
-        };
+impl SampleBuffers {
+    /// Room for so many samples.
+    pub(crate) fn new(gpu: &Gpu, n_samples: u32) -> Result<Self, Error> {
+        let floats = |name: &str, width: u64| gpu.storage(name, 4 * width * u64::from(n_samples));
         Ok(Self {
             n_samples,
             batch: gpu.storage_with("nerf.batch", bytemuck::bytes_of(&Batch::of(0)))?,
-            spans: floats("nerf.spans", n_samples, 4)?,
-            points: floats("nerf.points", n_samples, 4)?,
-            density: layers("nerf.density_layers", &widths.density)?,
-            color: layers("nerf.color_layers", &widths.color)?,
-            v_density: layers("nerf.v_density_layers", &widths.density)?,
-            v_color: layers("nerf.v_color_layers", &widths.color)?,
+            spans: floats("nerf.spans", 4)?,
+            points: floats("nerf.points", 4)?,
+            told: floats("nerf.told", 1)?,
+            colors: floats("nerf.colors", 4)?,
+        })
+    }
+}
+
+impl StepBuffers {
+    /// For so many rays and samples.
+    pub(crate) fn new(gpu: &Gpu, widths: &Widths, n_rays: u32, n_samples: u32) -> Result<Self, Error> {
+        let floats = |name: &str, n_rows: u32, width: u32| gpu.storage(name, 4 * u64::from(n_rows) * u64::from(width));
+        let in_tiles = n_samples.next_multiple_of(N_TILE);
+        Ok(Self {
+            held: floats("nerf.held", in_tiles, widths.n_held())?,
+            v_held: floats("nerf.v_held", in_tiles, widths.n_slopes())?,
             v_log_density: floats("nerf.v_log_density", n_samples, 1)?,
+            v_colors: floats("nerf.v_colors", n_samples, 4)?,
             seen: floats("nerf.seen", n_rays, 4)?,
             ray_errors: floats("nerf.ray_errors", n_rays, 2)?,
-            partial_density: partial_sums(&widths.density)?,
-            partial_color: partial_sums(&widths.color)?,
+            partial_sums: floats("nerf.partial_sums", n_samples.div_ceil(N_CHUNK), widths.n_weights())?,
         })
     }
 }

@@ -1,7 +1,7 @@
 // composite: what every ray sees, how far that is from its target, and the slopes back to its samples.
 //
 // threads   one per ray
-// reads     batch, loss, rays, spans, told [n_samples, 16], colors [n_samples] (before the sigmoid)
+// reads     batch, loss, rays, spans, told [n_samples], colors [n_samples] (before the sigmoid)
 // writes    seen [n_rays] (rgb before its background, transmittance), ray_errors [n_rays] (squared error of color, distance seen),
 //           v_log_density [n_samples], v_colors [n_samples]
 // twin      nerf/reference/ray.rs

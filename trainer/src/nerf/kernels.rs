@@ -30,6 +30,7 @@ const SHARED: &[Source] = &[
     shared!("visit"),
     shared!("random"),
     shared!("hash_grid"),
+    shared!("network_tile"),
     shared!("ray_loss"),
     shared!("learn_rule"),
     shared!("sh"),
@@ -48,47 +49,64 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("mark_cells"),
     kernel!("picture_rays"),
     kernel!("show_rays"),
-    kernel!("look_up"),
-    kernel!("layer_forward"),
-    kernel!("layer_backward"),
-    kernel!("layer_gradient"),
-    kernel!("sum_chunks"),
-    kernel!("color_inputs"),
+    kernel!("find_samples"),
+    kernel!("field_forward"),
     kernel!("composite"),
-    kernel!("told_backward"),
-    kernel!("scatter"),
+    kernel!("field_backward"),
+    kernel!("weight_slopes"),
     kernel!("learn_weights"),
     kernel!("learn_grid"),
     kernel!("end_step"),
 ];
 
-/// Samples that one partial sum of slopes towards weights goes over.
-pub(crate) const N_CHUNK: u32 = 512;
+/// Samples of a workgroup, `TILE` of `network_tile.wgsl`.
+pub(crate) const N_TILE: u32 = 32;
+/// Tiles of samples that one partial sum of slopes towards weights goes over.
+pub(crate) const CHUNK_TILES: u32 = 16;
+pub(crate) const N_CHUNK: u32 = CHUNK_TILES * N_TILE;
+/// Most rows of a layer.
+const MOST_ROWS: u32 = 64;
+/// Numbers that the first network tells, and colors, as the kernels have them.
+const N_TOLD: u32 = 16;
+const N_COLORS: u32 = 4;
 
 /// Widths of both networks as the kernels have them: multiples of four.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Widths {
-    pub(crate) density: Vec<u32>,
-    pub(crate) color: Vec<u32>,
+    pub(crate) n_features: u32,
+    pub(crate) n_hidden: u32,
+    pub(crate) n_color_in: u32,
     pub(crate) n_code: u32,
 }
 
 impl Widths {
     pub(crate) fn new(n_levels: u32, hidden: u32, n_code: u32) -> Self {
         let inputs = u32::try_from(N_DIRECTION).expect("16") + 15 + n_code;
-        let [features, hidden, inputs] = [2 * n_levels, hidden, inputs].map(|width| width.next_multiple_of(4));
-        Self { density: vec![features, hidden, 16], color: vec![inputs, hidden, hidden, 4], n_code }
+        let [n_features, n_hidden, n_color_in] = [2 * n_levels, hidden, inputs].map(|width| width.next_multiple_of(4));
+        assert!(n_features.max(n_hidden).max(n_color_in) <= MOST_ROWS, "a layer is wider than its rows");
+        Self { n_features, n_hidden, n_color_in, n_code }
     }
-}
 
-/// One layer.
-#[derive(Debug)]
-pub(crate) struct LayerPipelines {
-    pub(crate) n_in: u32,
-    pub(crate) n_out: u32,
-    pub(crate) forward: Pipeline,
-    pub(crate) backward: Pipeline,
-    pub(crate) gradient: Pipeline,
+    /// Inputs and outputs of all layers of both networks, in the order of their weights.
+    pub(crate) fn layers(&self) -> [[u32; 2]; 5] {
+        let Self { n_features, n_hidden, n_color_in, .. } = *self;
+        [[n_features, n_hidden], [n_hidden, N_TOLD], [n_color_in, n_hidden], [n_hidden, n_hidden], [n_hidden, N_COLORS]]
+    }
+
+    /// Weights of all layers.
+    pub(crate) fn n_weights(&self) -> u32 {
+        self.layers().iter().map(|[n_in, n_out]| n_in * n_out).sum()
+    }
+
+    /// Numbers of a sample that are kept for the way back: what goes into each layer.
+    pub(crate) fn n_held(&self) -> u32 {
+        self.layers().iter().map(|[n_in, _]| n_in).sum()
+    }
+
+    /// Slopes of a sample: towards what comes out of each layer.
+    pub(crate) fn n_slopes(&self) -> u32 {
+        self.layers().iter().map(|[_, n_out]| n_out).sum()
+    }
 }
 
 /// All that draws and learns a field.
@@ -97,6 +115,7 @@ pub(crate) struct FieldPipelines {
     pub(crate) count_samples: Pipeline,
     pub(crate) place_samples: Pipeline,
     pub(crate) write_samples: Pipeline,
+    pub(crate) find_samples: Pipeline,
     /// One a kind of hint, in the order in which they are taken.
     pub(crate) hint_cells: [Pipeline; 3],
     pub(crate) visit_cells: Pipeline,
@@ -105,30 +124,43 @@ pub(crate) struct FieldPipelines {
     pub(crate) mark_cells: Pipeline,
     pub(crate) picture_rays: Pipeline,
     pub(crate) show_rays: Pipeline,
-    pub(crate) look_up: Pipeline,
-    pub(crate) density: Vec<LayerPipelines>,
-    pub(crate) color_inputs: Pipeline,
-    pub(crate) color: Vec<LayerPipelines>,
+    /// Densities alone; colors too; and all that is kept for the way back.
+    pub(crate) densities: Pipeline,
+    pub(crate) colors: Pipeline,
+    pub(crate) forward: Pipeline,
     pub(crate) composite: Pipeline,
-    pub(crate) told_backward: Pipeline,
-    pub(crate) sum_chunks: Pipeline,
-    pub(crate) scatter: Pipeline,
+    pub(crate) field_backward: Pipeline,
+    pub(crate) weight_slopes: Pipeline,
     pub(crate) learn_weights: Pipeline,
     pub(crate) learn_grid: Pipeline,
     pub(crate) end_step: Pipeline,
 }
 
 impl FieldPipelines {
-    /// For batches of at most `n_samples`; rays of pictures have the code `no_image`.
+    /// For so many samples at most; `no_image` is the code of pictures that are of no image.
     pub(crate) fn new(gpu: &Gpu, widths: &Widths, n_samples: u32, no_image: u32) -> Result<Self, Error> {
-        let n_inputs = f64::from(widths.color[0]);
-        let code = [("N_IN", n_inputs), ("N_CODE", f64::from(widths.n_code))];
+        let Widths { n_features, n_hidden, n_color_in, n_code } = *widths;
+        let sizes = [
+            ("N_FEATURES", f64::from(n_features)),
+            ("N_HIDDEN", f64::from(n_hidden)),
+            ("N_COLOR_IN", f64::from(n_color_in)),
+            ("LANES", f64::from(2 * n_hidden)),
+        ];
+        let with = |more: &[(&'static str, f64)]| [&sizes[..], more].concat();
+        let forward = |colors: f64, keeps: f64| {
+            let kind = [("N_CODE", f64::from(n_code)), ("COLORS", colors), ("KEEPS", keeps)];
+            Pipeline::new(gpu, kernel!("field_forward"), &with(&kind))
+        };
+        // A thread has 16 weights.
+        let most_weights = widths.layers().iter().map(|[n_in, n_out]| n_in * n_out).max().expect("five layers");
+        let sums = [("SUM_LANES", f64::from(most_weights / 16)), ("CHUNK_TILES", f64::from(CHUNK_TILES))];
         let hint = |kind: f64| Pipeline::new(gpu, kernel!("hint_cells"), &[("KIND", kind)]);
         let plain = |kernel: Kernel| Pipeline::new(gpu, kernel, &[]);
         Ok(Self {
             count_samples: plain(kernel!("count_samples"))?,
             place_samples: Pipeline::new(gpu, kernel!("place_samples"), &[("CAPACITY", n_samples.into())])?,
             write_samples: plain(kernel!("write_samples"))?,
+            find_samples: plain(kernel!("find_samples"))?,
             hint_cells: [hint(0.0)?, hint(1.0)?, hint(2.0)?],
             visit_cells: plain(kernel!("visit_cells"))?,
             note_cells: plain(kernel!("note_cells"))?,
@@ -136,35 +168,15 @@ impl FieldPipelines {
             mark_cells: plain(kernel!("mark_cells"))?,
             picture_rays: Pipeline::new(gpu, kernel!("picture_rays"), &[("NO_IMAGE", no_image.into())])?,
             show_rays: plain(kernel!("show_rays"))?,
-            look_up: plain(kernel!("look_up"))?,
-            density: layers(gpu, &widths.density)?,
-            color_inputs: Pipeline::new(gpu, kernel!("color_inputs"), &code)?,
-            color: layers(gpu, &widths.color)?,
+            densities: forward(0.0, 0.0)?,
+            colors: forward(1.0, 0.0)?,
+            forward: forward(1.0, 1.0)?,
             composite: plain(kernel!("composite"))?,
-            told_backward: Pipeline::new(gpu, kernel!("told_backward"), &code[..1])?,
-            sum_chunks: plain(kernel!("sum_chunks"))?,
-            scatter: plain(kernel!("scatter"))?,
-            learn_weights: plain(kernel!("learn_weights"))?,
+            field_backward: Pipeline::new(gpu, kernel!("field_backward"), &sizes)?,
+            weight_slopes: Pipeline::new(gpu, kernel!("weight_slopes"), &with(&sums))?,
+            learn_weights: Pipeline::new(gpu, kernel!("learn_weights"), &[("CHUNK", f64::from(N_CHUNK))])?,
             learn_grid: plain(kernel!("learn_grid"))?,
             end_step: plain(kernel!("end_step"))?,
         })
     }
-}
-
-fn layers(gpu: &Gpu, widths: &[u32]) -> Result<Vec<LayerPipelines>, Error> {
-    let n_layers = widths.len() - 1;
-    let layer = |(ix, pair): (usize, &[u32])| {
-        let (n_in, n_out) = (pair[0], pair[1]);
-        let sizes = [("N_IN", f64::from(n_in)), ("N_OUT", f64::from(n_out))];
-        let with = |name, value| [&sizes[..], &[(name, value)]].concat();
-        let is = |what: bool| f64::from(u8::from(what));
-        Ok(LayerPipelines {
-            n_in,
-            n_out,
-            forward: Pipeline::new(gpu, kernel!("layer_forward"), &with("RELU", is(ix + 1 < n_layers)))?,
-            backward: Pipeline::new(gpu, kernel!("layer_backward"), &with("CUT", is(ix > 0)))?,
-            gradient: Pipeline::new(gpu, kernel!("layer_gradient"), &with("N_CHUNK", f64::from(N_CHUNK)))?,
-        })
-    };
-    widths.windows(2).enumerate().map(layer).collect()
 }

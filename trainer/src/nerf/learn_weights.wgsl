@@ -1,28 +1,49 @@
-// learn_weights: one step of Adam for the weights of a layer.
+// learn_weights: sums the slopes towards the weights of all layers over the chunks of samples, and takes one step of Adam.
 //
-// threads   one per weight
-// reads     rule, pace, v_weights
-// writes    weights, moments (first and second)
+// threads   256 per 16 times 4 weights: 16 share the chunks among them
+// reads     rule, pace, batch, partial_sums [n_chunks, n_weights]
+// writes    weights [n_weights], moments [n_weights / 4, 2] (first and second of 4 weights)
 // twin      optim/reference.rs
 // source    Kingma and Ba 2015; pull of Loshchilov and Hutter 2019 (AdamW)
 
+#import ray_batch
 #import learn_rule
 
 @group(0) @binding(0) var<uniform> rule: LearnRule;
 @group(0) @binding(1) var<storage, read> pace: Pace;
-@group(0) @binding(2) var<storage, read> v_weights: array<f32>;
-@group(0) @binding(3) var<storage, read_write> weights: array<f32>;
-@group(0) @binding(4) var<storage, read_write> moments: array<vec2f>;
+@group(0) @binding(2) var<storage, read> batch: Batch;
+@group(0) @binding(3) var<storage, read> partial_sums: array<vec4f>;
+@group(0) @binding(4) var<storage, read_write> weights: array<vec4f>;
+@group(0) @binding(5) var<storage, read_write> moments: array<vec4f>;
 
-@compute @workgroup_size(64)
+override CHUNK: u32;       // samples
+
+const WORDS = 16u;         // vec4 of weights of a workgroup
+const SHARES = 16u;
+const MOST = 1e30;
+
+var<workgroup> wg_sums: array<vec4f, 256>;
+
+@compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) lane: u32) {
-    let ix = wg.x * 64u + lane;
-    if ix >= arrayLength(&weights) { return; }
-    let v = v_weights[ix];
-    if !(abs(v) < 1e30) { return; } // What is not finite teaches nothing.
-    let moment = mix(vec2f(v, v * v), moments[ix], rule.betas);
-    moments[ix] = moment;
-    let corrected = moment * pace.correction;
-    let rate = rule.rate * pace.rate_frac;
-    weights[ix] -= rate * (corrected.x / (sqrt(corrected.y) + rule.epsilon) + rule.pull * weights[ix]);
+    let ix = wg.x * WORDS + lane % WORDS;
+    let n = arrayLength(&weights);
+    let n_chunks = (batch.n_samples + CHUNK - 1u) / CHUNK;
+    var sum = vec4f(0.0);
+    if ix < n {
+        for (var chunk = lane / WORDS; chunk < n_chunks; chunk += SHARES) { sum += partial_sums[chunk * n + ix]; }
+    }
+    wg_sums[lane] = sum;
+    workgroupBarrier(); // All shares are there before they are added up.
+    if lane < WORDS && ix < n {
+        var v = vec4f(0.0);
+        for (var share = 0u; share < SHARES; share++) { v += wg_sums[share * WORDS + lane]; }
+        let is_usable = abs(v) < vec4f(MOST); // What is not finite teaches nothing.
+        let first = select(moments[2u * ix], mix(v, moments[2u * ix], rule.betas.x), is_usable);
+        let second = select(moments[2u * ix + 1u], mix(v * v, moments[2u * ix + 1u], rule.betas.y), is_usable);
+        moments[2u * ix] = first;
+        moments[2u * ix + 1u] = second;
+        let step = first * pace.correction.x / (sqrt(second * pace.correction.y) + rule.epsilon) + rule.pull * weights[ix];
+        weights[ix] = select(weights[ix], weights[ix] - rule.rate * pace.rate_frac * step, is_usable);
+    }
 }

@@ -1,6 +1,6 @@
 //! A field on the GPU that learns from rays and draws pictures.
 
-use super::buffers::{BatchBuffers, FieldBuffers, FieldMoments, FieldSlopes, Occupancy, RaySlot};
+use super::buffers::{FieldBuffers, FieldMoments, FieldSlopes, Occupancy, RaySlot, SampleBuffers, StepBuffers};
 use super::kernels::{FieldPipelines, Widths};
 use super::options::{Effort, NerfOptions};
 use super::params::{Backdrop, Batch, LearnRule, March, Ray, RayLoss, Visit};
@@ -24,11 +24,11 @@ const KEPT_FRAC: f32 = 0.7;
 const VISITED_FRAC: f64 = 0.25;
 /// Most samples of a ray that is learned from, in even shares of the batch.
 const MOST_SHARES: u32 = 4;
-/// Samples that a ray of a picture takes at once.
+/// Samples that a ray of a picture takes at once, `ROUND` of `find_samples.wgsl`.
 const SAMPLES_OF_ROUND: u32 = 8;
 /// Rounds before it is asked whether any ray goes on, and how often it is asked: rays are no longer than that.
-const ROUNDS_PER_SUBMIT: u32 = 2;
-const MOST_ROUNDS: u32 = 128;
+const ROUNDS_PER_SUBMIT: u32 = 4;
+const MOST_SUBMITS: u32 = 64;
 /// Range of the entries at the start (Mueller et al. 2022, section 4).
 const FIRST_ENTRY: f64 = 1e-4;
 /// Differences of distance beyond this pull no more, in units of the radius.
@@ -49,10 +49,11 @@ pub(crate) struct Learner {
     pub(crate) slopes: FieldSlopes,
     pub(crate) occupancy: Occupancy,
     pipelines: FieldPipelines,
-    batch: BatchBuffers,
+    samples: SampleBuffers,
+    step: StepBuffers,
     slots: Vec<RaySlot>,
     rules: [Buffer; 2],
-    picture: Option<(RaySlot, Canvas)>,
+    picture: Option<(RaySlot, SampleBuffers, Canvas)>,
     passes: Passes,
 }
 
@@ -64,7 +65,7 @@ impl Learner {
         let n_levels = u32::try_from(shape.n_cells.len()).expect("a few levels");
         let widths = Widths::new(n_levels, n_hidden, 0);
         let field = FieldBuffers::new(gpu, &shape, &widths, sizes.n_codes)?;
-        let slopes = FieldSlopes::new(gpu, &shape, &widths)?;
+        let slopes = FieldSlopes::new(gpu, &shape)?;
         gpu.write(&slopes.scales, 0, bytemuck::cast_slice(&vec![FIRST_SCALE; shape.n_cells.len()]));
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of a u32")]
         let n_points = (f64::from(n_cells.pow(3)) * VISITED_FRAC) as u32;
@@ -74,7 +75,8 @@ impl Learner {
             pipelines: FieldPipelines::new(gpu, &widths, n_samples, sizes.n_codes - 1)?,
             moments: FieldMoments::new(gpu, &shape, &widths, &rule(options, 0.0))?,
             occupancy: Occupancy::new(gpu, &visit, sizes.has_depth)?,
-            batch: BatchBuffers::new(gpu, &widths, n_rays, n_samples)?,
+            samples: SampleBuffers::new(gpu, n_samples)?,
+            step: StepBuffers::new(gpu, &widths, n_rays, n_samples)?,
             slots: Vec::new(),
             rules: [
                 gpu.uniform_with("nerf.grid_rule", &rule(options, 0.0)),
@@ -98,24 +100,19 @@ impl Learner {
         };
         let entries: Vec<f32> = (0..2 * self.field.n_entries as usize).map(|ix| uniform(1, ix, FIRST_ENTRY)).collect();
         gpu.write(&self.field.grid, 0, bytemuck::cast_slice(&entries));
-        let networks = [(&self.field.density, &widths.density, 2), (&self.field.color, &widths.color, 10)];
-        for (weights, widths, stream) in networks {
-            for (ix, pair) in widths.windows(2).enumerate() {
-                let most = (6.0 / f64::from(pair[0] + pair[1])).sqrt();
-                let n = (pair[0] * pair[1]) as usize;
-                let layer: Vec<f32> = (0..n).map(|at| uniform(stream + ix as u64, at, most)).collect();
-                gpu.write(&weights[ix], 0, bytemuck::cast_slice(&layer));
-            }
+        let mut weights: Vec<f32> = Vec::new();
+        for ([n_in, n_out], stream) in widths.layers().into_iter().zip(2..) {
+            let most = (6.0 / f64::from(n_in + n_out)).sqrt();
+            weights.extend((0..(n_in * n_out) as usize).map(|at| uniform(stream, at, most)));
         }
+        gpu.write(&self.field.weights, 0, bytemuck::cast_slice(&weights));
     }
 
     /// Bytes of what is learned, its slopes and moments.
     pub(crate) fn bytes(&self) -> u64 {
-        let all = |buffers: &[Buffer]| buffers.iter().map(Buffer::bytes).sum::<u64>();
         let Self { field, slopes, moments, occupancy, .. } = self;
-        let weights = [&field.density, &field.color, &slopes.density, &slopes.color, &moments.density, &moments.color];
         let grids = [&field.grid, &slopes.grid, &moments.grid, &occupancy.thickness, &occupancy.occupied];
-        weights.into_iter().map(|buffers| all(buffers)).sum::<u64>() + grids.into_iter().map(Buffer::bytes).sum::<u64>()
+        grids.into_iter().chain([&field.weights, &moments.weights]).map(Buffer::bytes).sum()
     }
 
     /// Lists one step that learns from some rays, as the `slot_ix`-th of a submit.
@@ -153,25 +150,25 @@ impl Learner {
         gpu.write(&slot.loss, 0, bytemuck::bytes_of(&loss));
         let n_rays = u32::try_from(rays.len()).expect("at most the rays of a step");
         // All steps of a submit have as many rays.
-        gpu.write(&self.batch.batch, 0, bytemuck::bytes_of(&Batch::of(n_rays)));
-        let Self { pipelines, field, batch, occupancy, moments, slopes, passes: list, .. } = self;
-        let passes = FieldPasses { gpu, pipelines, field, batch, slot };
+        gpu.write(&self.samples.batch, 0, bytemuck::bytes_of(&Batch::of(n_rays)));
+        let Self { pipelines, field, samples, step: kept, occupancy, moments, slopes, passes: list, .. } = self;
+        let passes = FieldPasses { gpu, pipelines, field, samples, slot };
         let first_visit = if self.sizes.has_depth { FIRST_VISIT_WITH_DEPTH } else { VISIT_PERIOD };
         if step.is_multiple_of(VISIT_PERIOD) && step >= first_visit {
             passes.visit(list, occupancy, moments);
         }
         passes.count(list, occupancy);
         passes.place(list, occupancy);
-        passes.forward(list);
-        passes.backward(list, slopes);
-        passes.learn(list, [&self.rules[0], &self.rules[1]], slopes, moments);
+        passes.forward(list, kept);
+        passes.backward(list, kept, slopes);
+        passes.learn(list, [&self.rules[0], &self.rules[1]], kept, slopes, moments);
         Ok(())
     }
 
     /// Sends what is listed; the read tells when it is done.
     pub(crate) fn submit(&mut self, gpu: &Gpu) -> PendingRead {
         self.passes.submit(gpu);
-        gpu.begin_read(&self.batch.batch, 2)
+        gpu.begin_read(&self.samples.batch, 2)
     }
 
     /// Sends what is listed with a timestamp around each pass.
@@ -192,8 +189,8 @@ impl Learner {
         }
         let buffer = gpu.storage_with("nerf.hints", bytemuck::cast_slice(&padded(hints)))?;
         self.make_slot(gpu, 0)?;
-        let Self { pipelines, field, batch, occupancy, moments, slots, passes: list, .. } = self;
-        FieldPasses { gpu, pipelines, field, batch, slot: &slots[0] }.hint(list, occupancy, moments, &buffer);
+        let Self { pipelines, field, samples, occupancy, moments, slots, passes: list, .. } = self;
+        FieldPasses { gpu, pipelines, field, samples, slot: &slots[0] }.hint(list, occupancy, moments, &buffer);
         list.submit(gpu);
         list.forget_bindings(); // The hints are used once.
         Ok(())
@@ -218,29 +215,27 @@ impl Learner {
     ) -> Result<Picture, Error> {
         let n_pixels = camera.size_px[0] as usize * camera.size_px[1] as usize;
         self.make_canvas(gpu, n_pixels as u64)?;
-        let Some((slot, canvas)) = &self.picture else { return Err(Error::DeviceLost) };
+        let Some((slot, samples, canvas)) = &self.picture else { return Err(Error::DeviceLost) };
         gpu.write(&canvas.view, 0, bytemuck::bytes_of(&camera.view()));
         let backdrop = Backdrop { srgb: background_srgb, radius_m: f32_of(radius_m) };
         gpu.write(&canvas.backdrop, 0, bytemuck::bytes_of(&backdrop));
-        let Self { pipelines, field, batch, occupancy, passes: list, sizes, .. } = self;
-        let of_pixels = FieldPasses { gpu, pipelines, field, batch, slot };
+        let Self { pipelines, field, occupancy, passes: list, sizes, .. } = self;
+        let of_pixels = FieldPasses { gpu, pipelines, field, samples, slot };
         for first in (0..n_pixels).step_by(slot.n_rays as usize) {
             let n = (n_pixels - first).min(slot.n_rays as usize);
             let [first_ray, n_rays] = [first, n].map(|ix| u32::try_from(ix).expect("an image's pixels"));
-            let found = SAMPLES_OF_ROUND;
-            let march = March { first_ray, most_samples: found, most_found: found, ..march_of(sizes.effort) };
+            let march = March { first_ray, most_found: SAMPLES_OF_ROUND, ..march_of(sizes.effort) };
             gpu.write(&slot.march, 0, bytemuck::bytes_of(&march));
-            gpu.write(&batch.batch, 0, bytemuck::bytes_of(&Batch::of(n_rays)));
+            gpu.write(&samples.batch, 0, bytemuck::bytes_of(&Batch::of(n_rays)));
             of_pixels.picture_rays(list, canvas);
-            for _ in 0..MOST_ROUNDS {
+            for _ in 0..MOST_SUBMITS {
                 for _ in 0..ROUNDS_PER_SUBMIT {
-                    of_pixels.count(list, occupancy);
-                    of_pixels.place(list, occupancy);
-                    of_pixels.forward(list);
+                    of_pixels.find(list, occupancy);
+                    of_pixels.colors(list);
                     of_pixels.show(list, canvas);
                 }
                 list.submit(gpu);
-                if gpu.read::<u32>(&batch.batch, 2)?[1] == 0 {
+                if gpu.read::<u32>(&samples.batch, 2)?[1] == 0 {
                     break;
                 }
             }
@@ -251,11 +246,14 @@ impl Learner {
     }
 
     fn make_canvas(&mut self, gpu: &Gpu, n_pixels: u64) -> Result<(), Error> {
-        if self.picture.as_ref().is_none_or(|(_, canvas)| canvas.n_pixels < n_pixels) {
+        let n_rays = u32::try_from(n_pixels).unwrap_or(u32::MAX).min(self.sizes.effort.picture_rays);
+        let fits =
+            |(slot, _, canvas): &(RaySlot, SampleBuffers, Canvas)| canvas.n_pixels >= n_pixels && slot.n_rays >= n_rays;
+        if !self.picture.as_ref().is_some_and(fits) {
             self.passes.forget_bindings();
             self.picture = None;
-            let n_rays = self.sizes.effort.n_samples / SAMPLES_OF_ROUND;
-            self.picture = Some((RaySlot::new(gpu, n_rays)?, Canvas::new(gpu, n_pixels, n_rays)?));
+            let samples = SampleBuffers::new(gpu, SAMPLES_OF_ROUND * n_rays)?;
+            self.picture = Some((RaySlot::new(gpu, n_rays)?, samples, Canvas::new(gpu, n_pixels, n_rays)?));
         }
         Ok(())
     }
@@ -274,8 +272,7 @@ fn march_of(effort: Effort) -> March {
         n_cells: effort.n_cells,
         first_ray: 0,
         most_found: u32::MAX,
-        explore_key: 0,
-        unused: [0; 2],
+        unused: [0; 3],
     }
 }
 

@@ -1,6 +1,6 @@
 //! Samples along rays against their twin.
 
-use super::buffers::{BatchBuffers, FieldBuffers, Occupancy, RaySlot};
+use super::buffers::{FieldBuffers, Occupancy, RaySlot, SampleBuffers};
 use super::kernels::{FieldPipelines, Widths};
 use super::params::{self, Batch, Span, Visit};
 use super::passes::FieldPasses;
@@ -45,7 +45,7 @@ fn samples_lie_where_something_is_no_more_than_wanted() {
     let widths = Widths::new(2, 4, 0);
     let pipelines = FieldPipelines::new(&gpu, &widths, CAPACITY, 0).unwrap();
     let field = FieldBuffers::new(&gpu, &shape, &widths, 1).unwrap();
-    let batch = BatchBuffers::new(&gpu, &widths, N_RAYS, CAPACITY).unwrap();
+    let batch = SampleBuffers::new(&gpu, CAPACITY).unwrap();
     let occupancy =
         Occupancy::new(&gpu, &Visit { n_cells: N_CELLS, n_points: 1, kept_frac: 1.0, step: 0.1 }, false).unwrap();
     let bits = |word: usize| (0..32).fold(0u32, |bits, bit| bits | u32::from(is_occupied(32 * word + bit)) << bit);
@@ -70,11 +70,10 @@ fn samples_lie_where_something_is_no_more_than_wanted() {
         n_cells: N_CELLS,
         first_ray: 0,
         most_found: u32::MAX,
-        explore_key: 0,
-        unused: [0; 2],
+        unused: [0; 3],
     };
     gpu.write(&slot.march, 0, bytemuck::bytes_of(&march));
-    let passes = FieldPasses { gpu: &gpu, pipelines: &pipelines, field: &field, batch: &batch, slot: &slot };
+    let passes = FieldPasses { gpu: &gpu, pipelines: &pipelines, field: &field, samples: &batch, slot: &slot };
     let mut list = Passes::default();
     passes.count(&mut list, &occupancy);
     passes.place(&mut list, &occupancy);

@@ -1,7 +1,7 @@
 // note_cells: how much light the visited cells hold back.
 //
 // threads   one per point
-// reads     visit, steps ([1]: visits so far), told [n_points, 16]
+// reads     visit, steps ([1]: visits so far), told [n_points]
 // writes    thickness [n_cells^3]: largest share lately, over one step; negative: never visited
 // source    Mueller et al. 2022, appendix C
 
@@ -19,6 +19,6 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let ix = folded(wg, n_wgs) * 64u + lane;
     if ix >= visit.n_points { return; }
     let cell = visited_cell(visit, steps[1], ix);
-    let seen = density_of(told[16u * ix]) * visit.step;
+    let seen = density_of(told[ix]) * visit.step;
     thickness[cell] = max(visit.kept_frac * thickness[cell], seen);
 }

@@ -34,7 +34,7 @@ pub struct Effort {
     pub n_rays: u32,
     /// Most samples of a step, of all its rays.
     pub n_samples: u32,
-    /// Width of hidden layers.
+    /// Width of hidden layers, a multiple of 4 up to 64.
     pub n_hidden: u32,
     /// Cells of the occupancy along an axis, a power of two.
     pub n_cells: u32,
@@ -44,6 +44,8 @@ pub struct Effort {
     pub most_log2_entries: u32,
     /// Most levels of the grid, an even number.
     pub most_levels: u32,
+    /// Most rays of a picture that are followed at once.
+    pub picture_rays: u32,
 }
 
 impl Effort {
@@ -56,6 +58,7 @@ impl Effort {
         n_steps: 128,
         most_log2_entries: 15,
         most_levels: 8,
+        picture_rays: 1 << 11,
     };
     /// For a GPU.
     pub const FULL: Self = Self {
@@ -66,6 +69,7 @@ impl Effort {
         n_steps: 256,
         most_log2_entries: 19,
         most_levels: 16,
+        picture_rays: 1 << 18,
     };
 }
 

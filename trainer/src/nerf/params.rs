@@ -56,8 +56,7 @@ pub(crate) struct March {
     pub(crate) n_cells: u32,
     pub(crate) first_ray: u32,
     pub(crate) most_found: u32,
-    pub(crate) explore_key: u32,
-    pub(crate) unused: [u32; 2],
+    pub(crate) unused: [u32; 3],
 }
 
 /// `Visit` of `shared/visit.wgsl`.

@@ -1,11 +1,12 @@
 //! The stages of drawing and learning, as lists of passes.
 
-use super::buffers::{BatchBuffers, FieldBuffers, FieldMoments, FieldSlopes, Occupancy, RaySlot};
-use super::kernels::{FieldPipelines, LayerPipelines, N_CHUNK};
+use super::buffers::{FieldBuffers, FieldMoments, FieldSlopes, Occupancy, RaySlot, SampleBuffers, StepBuffers};
+use super::kernels::{CHUNK_TILES, FieldPipelines, N_TILE};
 use super::params::Backdrop;
 use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 use crate::splat::View;
+use std::ops::Range;
 
 /// What the passes of one batch of rays touch.
 #[derive(Clone, Copy, Debug)]
@@ -13,7 +14,7 @@ pub(crate) struct FieldPasses<'a> {
     pub(crate) gpu: &'a Gpu,
     pub(crate) pipelines: &'a FieldPipelines,
     pub(crate) field: &'a FieldBuffers,
-    pub(crate) batch: &'a BatchBuffers,
+    pub(crate) samples: &'a SampleBuffers,
     pub(crate) slot: &'a RaySlot,
 }
 
@@ -42,14 +43,10 @@ impl Canvas {
     }
 }
 
-/// One network with all that its layers hold.
-struct Network<'a> {
-    layers: &'a [LayerPipelines],
-    weights: &'a [Buffer],
-    held: &'a [Buffer],
-    v_held: &'a [Buffer],
-    partial_sums: &'a [Buffer],
-}
+/// Layers of both networks.
+const N_LAYERS: u64 = 5;
+/// Where the number of samples lies in a batch.
+const N_SAMPLES_BYTES: Range<u64> = 4..8;
 
 fn groups(n: u32, size: u32) -> u64 {
     u64::from(n).div_ceil(u64::from(size))
@@ -58,9 +55,9 @@ fn groups(n: u32, size: u32) -> u64 {
 impl FieldPasses<'_> {
     /// Finds the pieces of rays where something is.
     pub(crate) fn count(&self, list: &mut Passes, occupancy: &Occupancy) {
-        let Self { gpu, pipelines, batch, slot, .. } = *self;
+        let Self { gpu, pipelines, samples, slot, .. } = *self;
         let found = [
-            ("batch", &batch.batch),
+            ("batch", &samples.batch),
             ("march", &slot.march),
             ("rays", &slot.rays),
             ("occupied", &occupancy.occupied),
@@ -71,25 +68,25 @@ impl FieldPasses<'_> {
 
     /// After [`FieldPasses::count`]: makes samples of the pieces.
     pub(crate) fn place(&self, list: &mut Passes, occupancy: &Occupancy) {
-        let Self { gpu, pipelines, batch, slot, .. } = *self;
+        let Self { gpu, pipelines, samples, slot, .. } = *self;
         let shared =
-            [("batch", &batch.batch), ("march", &slot.march), ("n_found", &slot.n_found), ("rays", &slot.rays)];
+            [("batch", &samples.batch), ("march", &slot.march), ("n_found", &slot.n_found), ("rays", &slot.rays)];
         list.dispatch(gpu, &pipelines.place_samples, 1, &shared);
-        let written = [("occupied", &occupancy.occupied), ("spans", &batch.spans), ("points", &batch.points)];
+        let written = [("occupied", &occupancy.occupied), ("spans", &samples.spans), ("points", &samples.points)];
         list.dispatch(gpu, &pipelines.write_samples, groups(slot.n_rays, 64), &[&shared[..], &written].concat());
     }
 
     /// Looks at some cells of the occupancy anew. What the batch held is lost.
     pub(crate) fn visit(&self, list: &mut Passes, occupancy: &Occupancy, moments: &FieldMoments) {
-        let Self { gpu, pipelines, batch, .. } = *self;
+        let Self { gpu, pipelines, samples, .. } = *self;
         let Occupancy { thickness, visit, n_points, .. } = occupancy;
         let (visit, steps) = (("visit", visit), ("steps", &moments.steps));
         let of_points = groups(*n_points, 64);
-        let visited = [visit, steps, ("batch", &batch.batch), ("points", &batch.points)];
+        let visited = [visit, steps, ("batch", &samples.batch), ("points", &samples.points)];
         list.dispatch(gpu, &pipelines.visit_cells, of_points, &visited);
         self.densities(list);
         let thickness = ("thickness", thickness);
-        list.dispatch(gpu, &pipelines.note_cells, of_points, &[visit, steps, ("told", &batch.density[2]), thickness]);
+        list.dispatch(gpu, &pipelines.note_cells, of_points, &[visit, steps, ("told", &samples.told), thickness]);
         self.mark(list, occupancy, moments);
     }
 
@@ -113,42 +110,59 @@ impl FieldPasses<'_> {
         list.dispatch(gpu, &pipelines.mark_cells, of_words, &[thickness, sum, ("occupied", occupied), steps]);
     }
 
-    /// Density of every point, before the exponential, and what is handed on.
+    /// Density of every point, before the exponential.
     fn densities(&self, list: &mut Passes) {
-        let Self { gpu, pipelines, field, batch, .. } = *self;
-        let n_lanes = u64::from(batch.n_samples) * u64::from(field.n_levels);
-        let found = [
-            ("batch", &batch.batch),
-            ("levels", &field.levels),
-            ("points", &batch.points),
-            ("grid", &field.grid),
-            ("features", &batch.density[0]),
-        ];
-        list.dispatch(gpu, &pipelines.look_up, n_lanes.div_ceil(256), &found);
-        self.network_forward(list, &self.density());
+        self.networks(list, &self.pipelines.densities, &self.field.nothing);
     }
 
     /// Density and color of every sample, before the exponential and the sigmoid.
-    pub(crate) fn forward(&self, list: &mut Passes) {
-        let Self { gpu, pipelines, field, batch, slot } = *self;
-        self.densities(list);
-        let inputs = [
-            ("batch", &batch.batch),
+    pub(crate) fn colors(&self, list: &mut Passes) {
+        self.networks(list, &self.pipelines.colors, &self.field.nothing);
+    }
+
+    /// As [`FieldPasses::colors`], and all that is needed on the way back.
+    pub(crate) fn forward(&self, list: &mut Passes, step: &StepBuffers) {
+        self.networks(list, &self.pipelines.forward, &step.held);
+    }
+
+    fn networks(&self, list: &mut Passes, pipeline: &Pipeline, held: &Buffer) {
+        let Self { gpu, field, samples, slot, .. } = *self;
+        let buffers = [
+            ("batch", &samples.batch),
+            ("levels", &field.levels),
+            ("points", &samples.points),
+            ("grid", &field.grid),
+            ("weights", &field.weights),
             ("rays", &slot.rays),
-            ("spans", &batch.spans),
-            ("told", &batch.density[2]),
+            ("spans", &samples.spans),
             ("codes", &field.codes),
-            ("inputs", &batch.color[0]),
+            ("told", &samples.told),
+            ("colors", &samples.colors),
+            ("held", held),
         ];
-        list.dispatch(gpu, &pipelines.color_inputs, groups(batch.n_samples, 256), &inputs);
-        self.network_forward(list, &self.color());
+        list.dispatch(gpu, pipeline, groups(samples.n_samples, N_TILE), &buffers);
+    }
+
+    /// Finds the next samples of a picture's rays.
+    pub(crate) fn find(&self, list: &mut Passes, occupancy: &Occupancy) {
+        let Self { gpu, pipelines, samples, slot, .. } = *self;
+        list.clear_range(&samples.batch, N_SAMPLES_BYTES);
+        let found = [
+            ("march", &slot.march),
+            ("occupied", &occupancy.occupied),
+            ("batch", &samples.batch),
+            ("rays", &slot.rays),
+            ("spans", &samples.spans),
+            ("points", &samples.points),
+        ];
+        list.dispatch(gpu, &pipelines.find_samples, groups(slot.n_rays, 256), &found);
     }
 
     /// Fills in the rays of a picture's pixels.
     pub(crate) fn picture_rays(&self, list: &mut Passes, canvas: &Canvas) {
-        let Self { gpu, pipelines, batch, slot, .. } = *self;
+        let Self { gpu, pipelines, samples, slot, .. } = *self;
         let aimed = [
-            ("batch", &batch.batch),
+            ("batch", &samples.batch),
             ("march", &slot.march),
             ("view", &canvas.view),
             ("rays", &slot.rays),
@@ -159,16 +173,16 @@ impl FieldPasses<'_> {
 
     /// After [`FieldPasses::forward`]: the pixels that the rays see.
     pub(crate) fn show(&self, list: &mut Passes, canvas: &Canvas) {
-        let Self { gpu, pipelines, batch, slot, .. } = *self;
+        let Self { gpu, pipelines, samples, slot, .. } = *self;
         let shown = [
-            ("batch", &batch.batch),
+            ("batch", &samples.batch),
             ("march", &slot.march),
             ("view", &canvas.view),
             ("backdrop", &canvas.backdrop),
             ("rays", &slot.rays),
-            ("spans", &batch.spans),
-            ("told", &batch.density[2]),
-            ("colors", &batch.color[3]),
+            ("spans", &samples.spans),
+            ("told", &samples.told),
+            ("colors", &samples.colors),
             ("pixels", &canvas.pixels),
             ("depths", &canvas.depths),
             ("light", &canvas.light),
@@ -177,38 +191,41 @@ impl FieldPasses<'_> {
     }
 
     /// After [`FieldPasses::forward`]: the loss of every ray, and the slopes towards all that is learned.
-    pub(crate) fn backward(&self, list: &mut Passes, slopes: &FieldSlopes) {
-        let Self { gpu, pipelines, field, batch, slot } = *self;
-        let [counts, rays, spans] = [("batch", &batch.batch), ("rays", &slot.rays), ("spans", &batch.spans)];
-        let v_log_density = ("v_log_density", &batch.v_log_density);
+    pub(crate) fn backward(&self, list: &mut Passes, step: &StepBuffers, slopes: &FieldSlopes) {
+        let Self { gpu, pipelines, field, samples, slot } = *self;
+        let batch = ("batch", &samples.batch);
+        let (v_log_density, v_colors) = (("v_log_density", &step.v_log_density), ("v_colors", &step.v_colors));
         let composited = [
-            counts,
-            rays,
-            spans,
-            v_log_density,
+            batch,
             ("loss", &slot.loss),
-            ("told", &batch.density[2]),
-            ("colors", &batch.color[3]),
-            ("seen", &batch.seen),
-            ("ray_errors", &batch.ray_errors),
-            ("v_colors", &batch.v_color[3]),
+            ("rays", &slot.rays),
+            ("spans", &samples.spans),
+            ("told", &samples.told),
+            ("colors", &samples.colors),
+            ("seen", &step.seen),
+            ("ray_errors", &step.ray_errors),
+            v_log_density,
+            v_colors,
         ];
         list.dispatch(gpu, &pipelines.composite, groups(slot.n_rays, 64), &composited);
-        self.network_backward(list, &self.color(), &slopes.color);
-        let told = [counts, v_log_density, ("v_color_inputs", &batch.v_color[0]), ("v_told", &batch.v_density[2])];
-        list.dispatch(gpu, &pipelines.told_backward, groups(batch.n_samples, 256), &told);
-        self.network_backward(list, &self.density(), &slopes.density);
-        let n_lanes = u64::from(batch.n_samples) * u64::from(field.n_levels);
-        let scattered = [
-            counts,
+        let (held, v_held) = (("held", &step.held), ("v_held", &step.v_held));
+        let carried = [
+            batch,
             ("levels", &field.levels),
-            ("points", &batch.points),
-            ("v_features", &batch.v_density[0]),
+            ("points", &samples.points),
+            ("weights", &field.weights),
+            held,
+            v_log_density,
+            v_colors,
             ("scales", &slopes.scales),
+            v_held,
             ("v_grid", &slopes.grid),
             ("counts", &slopes.counts),
         ];
-        list.dispatch(gpu, &pipelines.scatter, n_lanes.div_ceil(256), &scattered);
+        list.dispatch(gpu, &pipelines.field_backward, groups(samples.n_samples, N_TILE), &carried);
+        let n_chunks = groups(samples.n_samples, N_TILE * CHUNK_TILES);
+        let summed = [batch, held, v_held, ("partial_sums", &step.partial_sums)];
+        list.dispatch(gpu, &pipelines.weight_slopes, N_LAYERS * n_chunks, &summed);
     }
 
     /// After [`FieldPasses::backward`]: one step of the optimiser, each with a rule of its own for the grid and for the weights. The
@@ -217,27 +234,21 @@ impl FieldPasses<'_> {
         &self,
         list: &mut Passes,
         [of_grid, of_weights]: [&Buffer; 2],
+        step: &StepBuffers,
         slopes: &FieldSlopes,
         moments: &FieldMoments,
     ) {
-        let Self { gpu, pipelines, field, .. } = *self;
+        let Self { gpu, pipelines, field, samples, .. } = *self;
         let (steps, pace) = (("steps", &moments.steps), ("pace", &moments.pace));
-        let networks = [
-            (&field.density, &slopes.density, &moments.density, &pipelines.density),
-            (&field.color, &slopes.color, &moments.color, &pipelines.color),
+        let weighed = [
+            ("rule", of_weights),
+            pace,
+            ("batch", &samples.batch),
+            ("partial_sums", &step.partial_sums),
+            ("weights", &field.weights),
+            ("moments", &moments.weights),
         ];
-        for (weights, v_weights, moments, layers) in networks {
-            for (ix, layer) in layers.iter().enumerate() {
-                let buffers = [
-                    ("rule", of_weights),
-                    pace,
-                    ("v_weights", &v_weights[ix]),
-                    ("weights", &weights[ix]),
-                    ("moments", &moments[ix]),
-                ];
-                list.dispatch(gpu, &pipelines.learn_weights, groups(layer.n_in * layer.n_out, 64), &buffers);
-            }
-        }
+        list.dispatch(gpu, &pipelines.learn_weights, (field.weights.bytes() / 16).div_ceil(16), &weighed);
         let (scales, largest) = (("scales", &slopes.scales), ("largest", &moments.largest));
         let learned = [
             ("rule", of_grid),
@@ -256,53 +267,5 @@ impl FieldPasses<'_> {
             1,
             &[("rule", of_grid), steps, pace, scales, largest, ("counts", &slopes.counts)],
         );
-    }
-
-    fn density(&self) -> Network<'_> {
-        let (held, v_held, partial_sums) = (&self.batch.density, &self.batch.v_density, &self.batch.partial_density);
-        Network { layers: &self.pipelines.density, weights: &self.field.density, held, v_held, partial_sums }
-    }
-
-    fn color(&self) -> Network<'_> {
-        let (held, v_held, partial_sums) = (&self.batch.color, &self.batch.v_color, &self.batch.partial_color);
-        Network { layers: &self.pipelines.color, weights: &self.field.color, held, v_held, partial_sums }
-    }
-
-    fn layer(&self, list: &mut Passes, pipeline: &Pipeline, width: u32, buffers: &[(&str, &Buffer)]) {
-        let buffers = [&[("batch", &self.batch.batch)][..], buffers].concat();
-        let n_lanes = groups(self.batch.n_samples, 4) * u64::from(width / 4);
-        list.dispatch(self.gpu, pipeline, n_lanes.div_ceil(256), &buffers);
-    }
-
-    fn network_forward(&self, list: &mut Passes, network: &Network<'_>) {
-        for (ix, layer) in network.layers.iter().enumerate() {
-            let (inputs, weights) = (("inputs", &network.held[ix]), ("weights", &network.weights[ix]));
-            self.layer(list, &layer.forward, layer.n_out, &[inputs, weights, ("outputs", &network.held[ix + 1])]);
-        }
-    }
-
-    fn network_backward(&self, list: &mut Passes, network: &Network<'_>, v_weights: &[Buffer]) {
-        for (ix, layer) in network.layers.iter().enumerate().rev() {
-            let (inputs, v_outputs) = (("inputs", &network.held[ix]), ("v_outputs", &network.v_held[ix + 1]));
-            let partial_sums = ("partial_sums", &network.partial_sums[ix]);
-            let n_lanes =
-                groups(self.batch.n_samples, N_CHUNK) * u64::from(layer.n_in / 4) * u64::from(layer.n_out / 4);
-            let summed = [("batch", &self.batch.batch), inputs, v_outputs, partial_sums];
-            list.dispatch(self.gpu, &layer.gradient, n_lanes.div_ceil(256), &summed);
-            let n_groups = groups(layer.n_in * layer.n_out / 4, 64);
-            list.dispatch(
-                self.gpu,
-                &self.pipelines.sum_chunks,
-                n_groups,
-                &[partial_sums, ("v_weights", &v_weights[ix])],
-            );
-            let weights = ("weights", &network.weights[ix]);
-            self.layer(
-                list,
-                &layer.backward,
-                layer.n_in,
-                &[inputs, weights, v_outputs, ("v_inputs", &network.v_held[ix])],
-            );
-        }
     }
 }

@@ -1,7 +1,7 @@
 // show_rays: the pixels that rays see, after one more round of samples; rays that see no further are ended.
 //
 // threads   one per ray
-// reads     batch, march (first_ray: the first pixel; most_found: samples of a round), view, backdrop, spans, told [n_samples, 16], colors [n_samples]
+// reads     batch, march (first_ray: the first pixel; most_found: samples of a round), view, backdrop, spans, told [n_samples], colors [n_samples]
 // writes    rays (begin of the next round; end), light [n_rays, 2] (rgb and transmittance; distance), pixels [n_pixels] (rgba8; a: coverage),
 //           depths [n_pixels] (metres along z, mean over what is seen; 0 where nothing is)
 // twin      nerf/reference/ray.rs

@@ -76,7 +76,7 @@ impl Sizes {
 
     /// Refuses sizes that no field has.
     pub(crate) fn check(&self) -> Result<(), Error> {
-        let Effort { n_rays, n_samples, n_hidden, n_cells, n_steps, .. } = self.effort;
+        let Effort { n_rays, n_samples, n_hidden, n_cells, n_steps, picture_rays, .. } = self.effort;
         let rises = self.n_cells.windows(2).all(|pair| pair[0] <= pair[1]);
         let is_usable = (1..=16).contains(&self.n_cells.len())
             && self.n_cells.iter().all(|n| (1..=1 << 20).contains(n))
@@ -85,7 +85,8 @@ impl Sizes {
             && self.n_codes > 0
             && (1..=1 << 20).contains(&n_rays)
             && (n_rays..=1 << 24).contains(&n_samples)
-            && (4..=256).contains(&n_hidden)
+            && (4..=64).contains(&n_hidden)
+            && (1..=1 << 20).contains(&picture_rays)
             && n_cells.is_power_of_two()
             && (4..=512).contains(&n_cells)
             && n_steps > 0;

@@ -28,6 +28,7 @@ fn options() -> NerfOptions {
         n_steps: 64,
         most_log2_entries: 13,
         most_levels: 6,
+        picture_rays: 1 << 10,
     };
     NerfOptions { effort: Some(effort), n_planned_steps: 300, ..NerfOptions::default() }
 }

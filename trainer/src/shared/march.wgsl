@@ -17,10 +17,8 @@ fn cell_in_occupancy(march: March, at: vec3f) -> u32 {
     return cell.x + march.n_cells * (cell.y + march.n_cells * cell.z);
 }
 
-// Whether a walk stops in a cell: where something is, and now and then where nothing seems to be, or it would never be found.
-fn is_looked_at(march: March, cell: u32) -> bool {
-    if (occupied[cell / 32u] >> (cell % 32u) & 1u) == 1u { return true; }
-    return march.explore_key != 0u && ((cell ^ march.explore_key) * 2654435761u >> 28u) == 0u;
+fn is_occupied(cell: u32) -> bool {
+    return (occupied[cell / 32u] >> (cell % 32u) & 1u) == 1u;
 }
 
 // Where a walk stands: the next piece begins at `t`.
@@ -37,7 +35,7 @@ fn next_piece(march: March, ray: Ray, from_t: f32) -> Walk {
         if !(t < ray.end) { break; }
         let length = step_at(march, ray.origin + t * ray.direction);
         let cell = cell_in_occupancy(march, ray.origin + (t + 0.5 * length) * ray.direction);
-        if is_looked_at(march, cell) { return Walk(t, length, false); }
+        if is_occupied(cell) { return Walk(t, length, false); }
         t += length;
     }
     return Walk(t, 0.0, true);

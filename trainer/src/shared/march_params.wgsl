@@ -6,8 +6,8 @@ struct March {
     n_cells: u32,          // of the occupancy along an axis
     first_ray: u32,        // of this batch among all of a picture
     most_found: u32,       // pieces of a ray that are looked for
-    explore_key: u32,      // of this step: one in 16 cells that hold nothing is looked at; 0: none is
-    unused: vec2u,
+    unused: u32,
+    unused_too: vec2u,
 }
 
 // Pieces that are kept of those found: every `stride`-th from `phase` on, each standing for as many.

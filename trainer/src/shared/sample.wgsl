@@ -12,7 +12,7 @@ struct Sample {
 
 fn sample_at(ix: u32) -> Sample {
     let span = spans[ix];
-    let density = density_of(told[16u * ix]);
+    let density = density_of(told[ix]);
     let rgb = 1.0 / (1.0 + exp(-colors[ix].rgb));
-    return Sample(span.begin, span.end, density, exp(-density * (span.end - span.begin)), rgb, is_cut_of(told[16u * ix]));
+    return Sample(span.begin, span.end, density, exp(-density * (span.end - span.begin)), rgb, is_cut_of(told[ix]));
 }

@@ -38,11 +38,9 @@ fn bad_state(reason: String) -> Error {
 impl Learner {
     /// What pictures need, by name.
     fn drawn(&self) -> Vec<(String, &Buffer)> {
-        let mut all = vec![("grid".to_owned(), &self.field.grid), ("occupied".to_owned(), &self.occupancy.occupied)];
-        for (name, weights) in [("density", &self.field.density), ("color", &self.field.color)] {
-            all.extend(weights.iter().enumerate().map(|(ix, buffer)| (format!("{name}_{ix}"), buffer)));
-        }
-        all
+        [("grid", &self.field.grid), ("occupied", &self.occupancy.occupied), ("weights", &self.field.weights)]
+            .map(|(name, buffer)| (name.to_owned(), buffer))
+            .to_vec()
     }
 
     /// All that decides how it goes on, by name.
@@ -51,6 +49,7 @@ impl Learner {
         all.extend(
             [
                 ("grid_moments", &self.moments.grid),
+                ("weight_moments", &self.moments.weights),
                 ("scales", &self.slopes.scales),
                 ("counts", &self.slopes.counts),
                 ("steps", &self.moments.steps),
@@ -59,9 +58,6 @@ impl Learner {
             ]
             .map(|(name, buffer)| (name.to_owned(), buffer)),
         );
-        for (name, moments) in [("density", &self.moments.density), ("color", &self.moments.color)] {
-            all.extend(moments.iter().enumerate().map(|(ix, buffer)| (format!("{name}_{ix}_moments"), buffer)));
-        }
         all
     }
 }

@@ -1,0 +1,152 @@
+// field_backward: slopes towards all layers from those towards densities and colors, and on to the entries of the grid, as whole numbers, so
+// that their order does not matter.
+//
+// threads   LANES per 32 samples
+// reads     batch, levels [n_levels], points, weights, held [n_tiles, n_held_rows, 8], v_log_density [n_samples],
+//           v_colors [n_samples], scales [n_levels] (powers of two)
+// writes    v_held [n_tiles, n_slope_rows, 8], v_grid [n_entries, 2] (slope times scale), counts: [0] saturated contributions
+// twin      nerf/reference/field.rs, nerf/reference/grid.rs
+
+#import folded
+#import ray_batch
+#import hash_grid
+#import network_tile
+
+@group(0) @binding(0) var<storage, read> batch: Batch;
+@group(0) @binding(1) var<storage, read> levels: array<Level>;
+@group(0) @binding(2) var<storage, read> points: array<vec4f>;
+@group(0) @binding(3) var<storage, read> weights: array<vec4f>;
+@group(0) @binding(4) var<storage, read> held: array<vec4f>;
+@group(0) @binding(5) var<storage, read> v_log_density: array<f32>;
+@group(0) @binding(6) var<storage, read> v_colors: array<vec4f>;
+@group(0) @binding(7) var<storage, read> scales: array<f32>;
+@group(0) @binding(8) var<storage, read_write> v_held: array<vec4f>;
+@group(0) @binding(9) var<storage, read_write> v_grid: array<atomic<i32>>;
+@group(0) @binding(10) var<storage, read_write> counts: array<atomic<u32>>;
+
+// One contribution is at most this: 2^7 of them fit into a sum.
+const MOST = 16777216.0;
+const NOT_CUT = 0xffffffffu;
+const NOT_KEPT = 0xffffffffu;
+
+fn keep(tile: u32, row: u32, part: u32, value: vec4f) {
+    v_held[(tile * n_slope_rows() + row) * PARTS + part] = value;
+}
+
+// Slopes towards the inputs of a layer, from rows of a bank to rows of the other; zero where the input was cut.
+fn layer(from_bank: u32, first_weight: u32, n_in: u32, n_out: u32, cut_row: u32, kept_row: u32, tile: u32, lane: u32) {
+    let part = lane % PARTS;
+    let n_words = n_in / 4u;
+    for (var group = lane / PARTS; group < n_words; group += LANES / PARTS) {
+        var sums: mat4x4f; // a column a row
+        for (var j = 0u; j < n_out; j += 4u) {
+            let at = from_bank + j * STRIDE + part;
+            let v = mat4x4f(wg_rows[at], wg_rows[at + STRIDE], wg_rows[at + 2u * STRIDE], wg_rows[at + 3u * STRIDE]);
+            let row = first_weight + j * n_words + group;
+            let w = mat4x4f(weights[row], weights[row + n_words], weights[row + 2u * n_words], weights[row + 3u * n_words]);
+            sums += v * transpose(w);
+        }
+        for (var i = 0u; i < 4u; i++) {
+            var sum = sums[i];
+            let row = 4u * group + i;
+            if cut_row != NOT_CUT {
+                let was = held[(tile * n_held_rows() + cut_row + row) * PARTS + part];
+                sum = select(vec4f(0.0), sum, was > vec4f(0.0));
+            }
+            wg_rows[(BANK - from_bank) + row * STRIDE + part] = sum;
+            if kept_row != NOT_KEPT { keep(tile, kept_row + row, part, sum); }
+        }
+    }
+    workgroupBarrier(); // The rows are there before the next layer reads them, and this one has read what that overwrites.
+}
+
+// What the compositing tells, in the first bank.
+fn color_slopes(tile: u32, lane: u32) {
+    for (var part = lane; part < PARTS; part += LANES) {
+        var v: mat4x4f;
+        for (var i = 0u; i < 4u; i++) {
+            let sample = tile * TILE + 4u * part + i;
+            if sample < batch.n_samples { v[i] = v_colors[sample]; }
+        }
+        let rows = transpose(v);
+        for (var row = 0u; row < N_COLORS; row++) {
+            wg_rows[row * STRIDE + part] = rows[row];
+            keep(tile, v_color_row() + row, part, rows[row]);
+        }
+    }
+    workgroupBarrier(); // The slopes are there before the last layer reads them.
+}
+
+// What goes towards density and what was handed on, from the second bank to the first.
+fn told_slopes(tile: u32, lane: u32) {
+    for (var item = lane; item < N_TOLD * PARTS; item += LANES) {
+        let row = item / PARTS;
+        let part = item % PARTS;
+        var v = vec4f(0.0);
+        if row == 0u {
+            for (var i = 0u; i < 4u; i++) {
+                let sample = tile * TILE + 4u * part + i;
+                if sample < batch.n_samples { v[i] = v_log_density[sample]; }
+            }
+        } else {
+            v = wg_rows[BANK + (N_HARMONICS - 1u + row) * STRIDE + part];
+        }
+        wg_rows[row * STRIDE + part] = v;
+        keep(tile, v_told_row() + row, part, v);
+    }
+    workgroupBarrier(); // The slopes are there before the layer reads them.
+}
+
+fn add(entry: u32, slope: vec2f) {
+    for (var feature = 0u; feature < 2u; feature++) {
+        let value = slope[feature];
+        if !(abs(value) < MOST) {
+            atomicAdd(&counts[0], 1u);
+        } else if value != 0.0 {
+            atomicAdd(&v_grid[2u * entry + feature], i32(round(value)));
+        }
+    }
+}
+
+// From the first bank to the grid. Four samples beside each other add up as long as they lie in the same cell.
+fn scatter(tile: u32, lane: u32) {
+    for (var item = lane; item < arrayLength(&levels) * PARTS; item += LANES) {
+        let level_ix = item / PARTS;
+        let level = levels[level_ix];
+        let part = item % PARTS;
+        let scale = scales[level_ix];
+        let v_0 = wg_rows[2u * level_ix * STRIDE + part] * scale;
+        let v_1 = wg_rows[(2u * level_ix + 1u) * STRIDE + part] * scale;
+        let first = tile * TILE + 4u * part;
+        if first >= batch.n_samples { continue; }
+        let n = min(4u, batch.n_samples - first);
+        var cell = cell_of(level, points[first].xyz);
+        var sums: array<vec2f, 8>;
+        for (var i = 0u; i < n; i++) {
+            for (var corner = 0u; corner < 8u; corner++) { sums[corner] += weight_of(cell, step_of(corner)) * vec2f(v_0[i], v_1[i]); }
+            let here = cell.first;
+            if i + 1u < n { cell = cell_of(level, points[first + i + 1u].xyz); }
+            if i + 1u == n || any(cell.first != here) {
+                for (var corner = 0u; corner < 8u; corner++) {
+                    add(entry_of(level, here + step_of(corner)), sums[corner]);
+                    sums[corner] = vec2f(0.0);
+                }
+            }
+        }
+    }
+}
+
+@compute @workgroup_size(LANES)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let tile = folded(wg, n_wgs);
+    if tile * TILE < batch.n_samples {
+        color_slopes(tile, lane);
+        layer(0u, color_weights(), N_HIDDEN, N_COLORS, hidden_2_row(), v_hidden_2_row(), tile, lane);
+        layer(BANK, hidden_2_weights(), N_HIDDEN, N_HIDDEN, hidden_1_row(), v_hidden_1_row(), tile, lane);
+        layer(0u, hidden_1_weights(), N_COLOR_IN, N_HIDDEN, NOT_CUT, NOT_KEPT, tile, lane);
+        told_slopes(tile, lane);
+        layer(0u, told_weights(), N_HIDDEN, N_TOLD, hidden_0_row(), 0u, tile, lane);
+        layer(BANK, 0u, N_FEATURES, N_HIDDEN, NOT_CUT, NOT_KEPT, tile, lane);
+        scatter(tile, lane);
+    }
+}

@@ -1,0 +1,61 @@
+// find_samples: the next samples of the rays of a picture, at most ROUND each.
+//
+// threads   one per ray
+// reads     march, occupied (a bit a cell)
+// writes    rays (first_sample, n_samples), found (n_samples, zero before), spans, points [n_samples] (middle of the sample, in the unit cube)
+// twin      nerf/reference/march.rs
+//
+// Where the samples of 256 rays lie depends on who comes first; what becomes of them does not.
+
+#import folded
+#import ray_batch
+#import march_params
+#import space
+#import march
+#import scan
+
+struct Found {
+    n_rays: u32,
+    n_samples: atomic<u32>,
+    unused: vec2u,
+}
+
+@group(0) @binding(0) var<uniform> march: March;
+@group(0) @binding(1) var<storage, read> occupied: array<u32>;
+@group(0) @binding(2) var<storage, read_write> batch: Found;
+@group(0) @binding(3) var<storage, read_write> rays: array<Ray>;
+@group(0) @binding(4) var<storage, read_write> spans: array<Span>;
+@group(0) @binding(5) var<storage, read_write> points: array<vec4f>;
+
+const ROUND = 8u;
+
+var<workgroup> wg_first: u32;
+
+@compute @workgroup_size(256)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let ray_ix = folded(wg, n_wgs) * 256u + lane;
+    var pieces: array<vec2f, ROUND>;
+    var n = 0u;
+    var ray: Ray;
+    if ray_ix < batch.n_rays {
+        ray = rays[ray_ix];
+        var walk = next_piece(march, ray, begin_of(march, ray));
+        while !walk.is_over && n < ROUND {
+            pieces[n] = vec2f(walk.t, walk.t + walk.length);
+            n++;
+            walk = next_piece(march, ray, walk.t + walk.length);
+        }
+    }
+    var total: u32;
+    let below = exclusive_scan(lane, n, &total);
+    if lane == 0u { wg_first = atomicAdd(&batch.n_samples, total); }
+    let first = workgroupUniformLoad(&wg_first) + below;
+    if ray_ix < batch.n_rays {
+        rays[ray_ix].first_sample = first;
+        rays[ray_ix].n_samples = n;
+        for (var i = 0u; i < n; i++) {
+            spans[first + i] = Span(pieces[i].x, pieces[i].y, ray_ix, 0u);
+            points[first + i] = vec4f(contract(ray.origin + 0.5 * (pieces[i].x + pieces[i].y) * ray.direction), 0.0);
+        }
+    }
+}

@@ -1,0 +1,90 @@
+// weight_slopes: slopes towards the weights of all layers, summed over a chunk of the samples.
+//
+// threads   SUM_LANES per layer and chunk of CHUNK_TILES * 32 samples
+// reads     batch, held [n_tiles, n_held_rows, 8], v_held [n_tiles, n_slope_rows, 8]
+// writes    partial_sums [n_chunks, n_weights]
+// twin      nerf/reference/network.rs
+//
+// A thread has 4 outputs and 4 inputs of the layer; where that leaves threads over, they share the samples among them.
+
+#import folded
+#import ray_batch
+#import network_tile
+
+@group(0) @binding(0) var<storage, read> batch: Batch;
+@group(0) @binding(1) var<storage, read> held: array<vec4f>;
+@group(0) @binding(2) var<storage, read> v_held: array<vec4f>;
+@group(0) @binding(3) var<storage, read_write> partial_sums: array<f32>;
+
+override SUM_LANES: u32;
+override CHUNK_TILES: u32;
+
+const N_LAYERS = 5u;
+
+struct Layer {
+    n_in: u32,
+    n_out: u32,
+    held_row: u32,
+    v_row: u32,
+    first_weight: u32,     // in vec4
+}
+
+fn layer_of(ix: u32) -> Layer {
+    switch ix {
+        case 0u: { return Layer(N_FEATURES, N_HIDDEN, 0u, 0u, 0u); }
+        case 1u: { return Layer(N_HIDDEN, N_TOLD, hidden_0_row(), v_told_row(), told_weights()); }
+        case 2u: { return Layer(N_COLOR_IN, N_HIDDEN, color_input_row(), v_hidden_1_row(), hidden_1_weights()); }
+        case 3u: { return Layer(N_HIDDEN, N_HIDDEN, hidden_1_row(), v_hidden_2_row(), hidden_2_weights()); }
+        default: { return Layer(N_HIDDEN, N_COLORS, hidden_2_row(), v_color_row(), color_weights()); }
+    }
+}
+
+@compute @workgroup_size(SUM_LANES)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let ix = folded(wg, n_wgs);
+    let first_tile = ix / N_LAYERS * CHUNK_TILES;
+    let layer = layer_of(ix % N_LAYERS);
+    let n_in = layer.n_in / 4u;
+    let n_out = layer.n_out / 4u;
+    let n_blocks = n_in * n_out;
+    let n_shares = min(PARTS, SUM_LANES / n_blocks); // of the samples
+    let share = lane / n_blocks;
+    // Rows of neighboring threads follow each other, so that they come from different memory banks.
+    let input = lane % n_blocks % n_in;
+    let output = lane % n_blocks / n_in;
+    let n_tiles = (batch.n_samples + TILE - 1u) / TILE;
+    if first_tile < n_tiles {
+        var sums: mat4x4f; // a column an output
+        for (var tile = first_tile; tile < min(first_tile + CHUNK_TILES, n_tiles); tile++) {
+            for (var item = lane; item < layer.n_in * PARTS; item += SUM_LANES) {
+                wg_rows[item / PARTS * STRIDE + item % PARTS] = held[(tile * n_held_rows() + layer.held_row) * PARTS + item];
+            }
+            for (var item = lane; item < layer.n_out * PARTS; item += SUM_LANES) {
+                wg_rows[BANK + item / PARTS * STRIDE + item % PARTS] = v_held[(tile * n_slope_rows() + layer.v_row) * PARTS + item];
+            }
+            workgroupBarrier(); // All rows of the tile are there before they are read.
+            if share < n_shares {
+                for (var part = share; part < PARTS; part += n_shares) {
+                    let h_at = input * STRIDE + part;
+                    let h_step = n_in * STRIDE;
+                    let h = mat4x4f(wg_rows[h_at], wg_rows[h_at + h_step], wg_rows[h_at + 2u * h_step], wg_rows[h_at + 3u * h_step]);
+                    let v_at = BANK + output * STRIDE + part;
+                    let v_step = n_out * STRIDE;
+                    let v = mat4x4f(wg_rows[v_at], wg_rows[v_at + v_step], wg_rows[v_at + 2u * v_step], wg_rows[v_at + 3u * v_step]);
+                    sums += transpose(h) * v;
+                }
+            }
+            workgroupBarrier(); // All have read before the next tile overwrites the rows.
+        }
+        for (var j = 0u; j < 4u; j++) { wg_rows[4u * lane + j] = sums[j]; }
+        workgroupBarrier(); // All shares are there before they are added up.
+        if share == 0u {
+            for (var j = 0u; j < 4u; j++) {
+                var sum = vec4f(0.0);
+                for (var other = 0u; other < n_shares; other++) { sum += wg_rows[4u * (lane + other * n_blocks) + j]; }
+                let row = ix / N_LAYERS * 4u * n_weight_words() + 4u * layer.first_weight + (output + j * n_out) * layer.n_in;
+                for (var i = 0u; i < 4u; i++) { partial_sums[row + input + i * n_in] = sum[i]; }
+            }
+        }
+    }
+}
