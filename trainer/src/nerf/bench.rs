@@ -3,7 +3,7 @@
 //! Rays begin anywhere in a cube that is occupied throughout and are all equally long, so that a step has a known number of
 //! samples; their colors are noise. The occupancy is not visited.
 
-use super::learner::{Learner, STEPS_PER_SUBMIT};
+use super::learner::{Compiled, Learner, STEPS_PER_SUBMIT};
 use super::options::{Effort, NerfOptions};
 use super::params::Ray;
 use super::rays::{mixed, unit};
@@ -43,7 +43,8 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
     let (n_levels, coarsest, finest, log2_entries) = GRID;
     let shape = GridShape::between(coarsest, finest, n_levels, log2_entries);
     let sizes = Sizes { n_cells: shape.n_cells, log2_entries, n_codes: 1, has_depth: false, effort };
-    let mut learner = Learner::new(gpu, &options, sizes)?;
+    let compiled = Compiled::new(gpu, &sizes)?;
+    let mut learner = Learner::new(gpu, &options, sizes, compiled)?;
     let rays = synthetic_rays(effort);
     let submit = |learner: &mut Learner, n_steps: usize| {
         for slot_ix in 0..n_steps {

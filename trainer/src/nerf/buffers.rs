@@ -50,7 +50,7 @@ pub(crate) struct FieldMoments {
 /// Where something is: the cells that rays are walked through.
 #[derive(Debug)]
 pub(crate) struct Occupancy {
-    /// A bit a cell.
+    /// A bit a cell, then a bit a block of cells.
     pub(crate) occupied: Buffer,
     /// An f32 a cell: the share of light that it lately held back over a step; negative: never visited; 0: never looked at.
     pub(crate) thickness: Buffer,
@@ -60,12 +60,19 @@ pub(crate) struct Occupancy {
     pub(crate) n_cells: u32,
 }
 
+/// Blocks of cells along an axis, as in `march.wgsl`.
+pub(crate) fn n_blocks(n_cells: u32) -> u32 {
+    const MOST_BLOCKS: u32 = 16;
+    n_cells.min(MOST_BLOCKS)
+}
+
 impl Occupancy {
     /// All cells hold something as far as anyone knows; where there is depth it is left to the depth to say so.
     pub(crate) fn new(gpu: &Gpu, visit: &Visit, has_depth: bool) -> Result<Self, Error> {
         let n = visit.n_cells.pow(3) as usize;
+        let n_words = n / 32 + n_blocks(visit.n_cells).pow(3).div_ceil(32) as usize;
         Ok(Self {
-            occupied: gpu.storage_with("nerf.occupied", &vec![255; n / 8])?,
+            occupied: gpu.storage_with("nerf.occupied", &vec![255; 4 * n_words.next_multiple_of(4)])?,
             thickness: gpu.storage_with(
                 "nerf.thickness",
                 bytemuck::cast_slice(&vec![if has_depth { 0.0f32 } else { -1.0 }; n]),

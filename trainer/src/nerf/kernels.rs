@@ -47,6 +47,7 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("note_cells"),
     kernel!("sum_cells"),
     kernel!("mark_cells"),
+    kernel!("mark_blocks"),
     kernel!("picture_rays"),
     kernel!("show_rays"),
     kernel!("find_samples"),
@@ -122,6 +123,7 @@ pub(crate) struct FieldPipelines {
     pub(crate) note_cells: Pipeline,
     pub(crate) sum_cells: Pipeline,
     pub(crate) mark_cells: Pipeline,
+    pub(crate) mark_blocks: Pipeline,
     pub(crate) picture_rays: Pipeline,
     pub(crate) show_rays: Pipeline,
     /// Densities alone; colors too; and all that is kept for the way back.
@@ -166,6 +168,7 @@ impl FieldPipelines {
             note_cells: plain(kernel!("note_cells"))?,
             sum_cells: plain(kernel!("sum_cells"))?,
             mark_cells: plain(kernel!("mark_cells"))?,
+            mark_blocks: plain(kernel!("mark_blocks"))?,
             picture_rays: Pipeline::new(gpu, kernel!("picture_rays"), &[("NO_IMAGE", no_image.into())])?,
             show_rays: plain(kernel!("show_rays"))?,
             densities: forward(0.0, 0.0)?,

@@ -19,6 +19,8 @@
 @group(0) @binding(6) var<storage, read_write> v_grid: array<vec2i>;
 @group(0) @binding(7) var<storage, read_write> largest: array<atomic<u32>>;
 
+const MOST_LEVELS = 16u;
+
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let ix = folded(wg, n_wgs) * 256u + lane;
@@ -27,7 +29,10 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     if all(sum == vec2i(0)) { return; }
     v_grid[ix] = vec2i(0);
     var level = 0u;
-    while level + 1u < arrayLength(&levels) && ix >= levels[level + 1u].begin { level++; }
+    for (var step = MOST_LEVELS / 2u; step > 0u; step /= 2u) {
+        let above = min(level + step, arrayLength(&levels) - 1u);
+        if ix >= levels[above].begin { level = above; }
+    }
     let most = max(abs(sum.x), abs(sum.y));
     atomicMax(&largest[level], u32(most)); // The order of a maximum does not matter.
     let v = vec2f(sum) / scales[level];

@@ -57,13 +57,38 @@ pub(crate) struct Learner {
     passes: Passes,
 }
 
+/// Kernels for fields of some sizes.
+#[derive(Debug)]
+pub(crate) struct Compiled {
+    pipelines: FieldPipelines,
+    widths: Widths,
+    n_samples: u32,
+    n_codes: u32,
+}
+
+impl Compiled {
+    pub(crate) fn new(gpu: &Gpu, sizes: &Sizes) -> Result<Self, Error> {
+        let (widths, n_samples, n_codes) = (widths_of(sizes), sizes.effort.n_samples, sizes.n_codes);
+        let pipelines = FieldPipelines::new(gpu, &widths, n_samples, n_codes - 1)?;
+        Ok(Self { pipelines, widths, n_samples, n_codes })
+    }
+
+    pub(crate) fn is_for(&self, sizes: &Sizes) -> bool {
+        let Self { widths, n_samples, n_codes, .. } = self;
+        (widths, n_samples, n_codes) == (&widths_of(sizes), &sizes.effort.n_samples, &sizes.n_codes)
+    }
+}
+
+fn widths_of(sizes: &Sizes) -> Widths {
+    Widths::new(u32::try_from(sizes.n_cells.len()).expect("a few levels"), sizes.effort.n_hidden, 0)
+}
+
 impl Learner {
     /// A field that knows nothing.
-    pub(crate) fn new(gpu: &Gpu, options: &NerfOptions, sizes: Sizes) -> Result<Self, Error> {
-        let Effort { n_rays, n_samples, n_hidden, n_cells, n_steps, .. } = sizes.effort;
+    pub(crate) fn new(gpu: &Gpu, options: &NerfOptions, sizes: Sizes, compiled: Compiled) -> Result<Self, Error> {
+        let Effort { n_rays, n_samples, n_cells, n_steps, .. } = sizes.effort;
         let shape = sizes.shape();
-        let n_levels = u32::try_from(shape.n_cells.len()).expect("a few levels");
-        let widths = Widths::new(n_levels, n_hidden, 0);
+        let Compiled { pipelines, widths, .. } = compiled;
         let field = FieldBuffers::new(gpu, &shape, &widths, sizes.n_codes)?;
         let slopes = FieldSlopes::new(gpu, &shape)?;
         gpu.write(&slopes.scales, 0, bytemuck::cast_slice(&vec![FIRST_SCALE; shape.n_cells.len()]));
@@ -72,7 +97,7 @@ impl Learner {
         let visit =
             Visit { n_cells, n_points: n_points.min(n_samples), kept_frac: KEPT_FRAC, step: 2.0 / n_steps as f32 };
         let learner = Self {
-            pipelines: FieldPipelines::new(gpu, &widths, n_samples, sizes.n_codes - 1)?,
+            pipelines,
             moments: FieldMoments::new(gpu, &shape, &widths, &rule(options, 0.0))?,
             occupancy: Occupancy::new(gpu, &visit, sizes.has_depth)?,
             samples: SampleBuffers::new(gpu, n_samples)?,

@@ -1,6 +1,6 @@
 //! Samples along rays against their twin.
 
-use super::buffers::{FieldBuffers, Occupancy, RaySlot, SampleBuffers};
+use super::buffers::{FieldBuffers, FieldMoments, Occupancy, RaySlot, SampleBuffers};
 use super::kernels::{FieldPipelines, Widths};
 use super::params::{self, Batch, Span, Visit};
 use super::passes::FieldPasses;
@@ -11,16 +11,20 @@ use crate::gpu::{Gpu, GpuOptions, Passes, f32_of, f32s_of};
 use crate::mismatches::Mismatches;
 use crate::splat::reference::scene::Random;
 
-const N_CELLS: u32 = 16;
+const N_CELLS: u32 = 64;
 /// More than a workgroup scans at once.
 const N_RAYS: u32 = 300;
 const CAPACITY: u32 = 16_384;
-const MARCH: March = March { step: 0.0625, most_samples: 12, n_cells: N_CELLS as usize };
+const MARCH: March = March { step: 0.03125, most_samples: 12, n_cells: N_CELLS as usize };
 /// A place so close to a cell's side, in cells, may be taken for the next one in f32.
 const CLEAR: f64 = 1e-4;
 
+/// Half of the cells in half of the blocks, which are 4 cells wide.
 fn is_occupied(cell: usize) -> bool {
-    cell.wrapping_mul(2_654_435_761) >> 7 & 1 == 1
+    let n = N_CELLS as usize;
+    let block = cell % n / 4 + n * (cell / n % n / 4 + n * (cell / n / n / 4));
+    let is_taken = |ix: usize| ix.wrapping_mul(2_654_435_761) >> 7 & 1 == 1;
+    is_taken(block + 1) && is_taken(cell)
 }
 
 /// A ray, where it begins and ends, and its shift: numbers that f32 holds exactly.
@@ -48,9 +52,10 @@ fn samples_lie_where_something_is_no_more_than_wanted() {
     let batch = SampleBuffers::new(&gpu, CAPACITY).unwrap();
     let occupancy =
         Occupancy::new(&gpu, &Visit { n_cells: N_CELLS, n_points: 1, kept_frac: 1.0, step: 0.1 }, false).unwrap();
-    let bits = |word: usize| (0..32).fold(0u32, |bits, bit| bits | u32::from(is_occupied(32 * word + bit)) << bit);
-    let words: Vec<u32> = (0..N_CELLS.pow(3) as usize / 32).map(bits).collect();
-    gpu.write(&occupancy.occupied, 0, bytemuck::cast_slice(&words));
+    let thickness: Vec<f32> = (0..N_CELLS.pow(3) as usize).map(|cell| f32::from(u8::from(is_occupied(cell)))).collect();
+    gpu.write(&occupancy.thickness, 0, bytemuck::cast_slice(&thickness));
+    let rule = bytemuck::Zeroable::zeroed();
+    let moments = FieldMoments::new(&gpu, &shape, &widths, &rule).unwrap();
     let slot = RaySlot::new(&gpu, N_RAYS).unwrap();
     let rays = rays();
     let gpu_ray = |(origin, direction, range, shift): &TestRay| params::Ray {
@@ -75,6 +80,7 @@ fn samples_lie_where_something_is_no_more_than_wanted() {
     gpu.write(&slot.march, 0, bytemuck::bytes_of(&march));
     let passes = FieldPasses { gpu: &gpu, pipelines: &pipelines, field: &field, samples: &batch, slot: &slot };
     let mut list = Passes::default();
+    passes.mark(&mut list, &occupancy, &moments);
     passes.count(&mut list, &occupancy);
     passes.place(&mut list, &occupancy);
     list.submit(&gpu);

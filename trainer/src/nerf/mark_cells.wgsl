@@ -2,7 +2,7 @@
 //
 // threads   one per 32 cells
 // reads     thickness, thickness_sum
-// writes    occupied (a bit a cell), steps ([1]: visits so far)
+// writes    occupied (a bit a cell, before the blocks), steps ([1]: visits so far)
 
 #import folded
 
@@ -17,7 +17,7 @@ const ENOUGH = 0.02;
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let word = folded(wg, n_wgs) * 64u + lane;
-    if word >= arrayLength(&occupied) { return; }
+    if 32u * word >= arrayLength(&thickness) { return; }
     let mean = f32(thickness_sum[0]) / 1024.0 / f32(arrayLength(&thickness));
     let enough = min(ENOUGH, 0.5 * mean);
     var bits = 0u;

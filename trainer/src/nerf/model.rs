@@ -4,7 +4,7 @@ mod checkpoint;
 
 use super::carve;
 use super::extent::Extent;
-use super::learner::{Learner, STEPS_PER_SUBMIT};
+use super::learner::{Compiled, Learner, STEPS_PER_SUBMIT};
 use super::options::{Effort, NerfOptions};
 use super::rays::{self, Draw, RayImage};
 use super::sizes::Sizes;
@@ -33,6 +33,8 @@ pub struct NerfModel {
     options: NerfOptions,
     images: Vec<RayImage>,
     field: Option<(Extent, Learner)>,
+    /// For the field that is to come.
+    compiled: Option<Compiled>,
     /// Keyframes came or went since the extent was looked at.
     is_extent_due: bool,
     /// Images whose depth was told to the field: the first so many.
@@ -58,6 +60,7 @@ impl NerfModel {
             options,
             images,
             field: None,
+            compiled: None,
             is_extent_due: false,
             n_hinted: 0,
             in_flight: None,
@@ -88,22 +91,35 @@ impl NerfModel {
         if !std::mem::take(&mut self.is_extent_due) && self.field.is_some() {
             return Ok(true);
         }
+        self.images.par_iter().for_each(|image| {
+            image.depth_m();
+        });
         self.fit_extent()?;
         self.hint()?;
         Ok(true)
     }
 
-    fn fit_extent(&mut self) -> Result<(), Error> {
+    /// What the images ask for.
+    fn sizes(&self) -> Result<(Extent, Sizes), Error> {
         let keyframes = || self.images.iter().map(|image| &*image.keyframe);
         let extent = Extent::of(keyframes());
+        let sizes = Sizes::choose(&self.options, self.effort(), self.gpu.max_binding_bytes(), keyframes(), &extent)?;
+        Ok((extent, sizes))
+    }
+
+    fn fit_extent(&mut self) -> Result<(), Error> {
+        let (extent, sizes) = self.sizes()?;
         if self.field.as_ref().is_some_and(|(known, _)| !known.is_outgrown_by(&extent)) {
             return Ok(());
         }
-        let sizes = Sizes::choose(&self.options, self.effort(), self.gpu.max_binding_bytes(), keyframes(), &extent)?;
         log::debug!("nerf: {extent:?}, {sizes:?}");
         self.settle()?;
         self.field = None; // Its memory is free before the next one takes some.
-        self.field = Some((extent, Learner::new(&self.gpu, &self.options, sizes)?));
+        let compiled = match self.compiled.take().filter(|compiled| compiled.is_for(&sizes)) {
+            Some(compiled) => compiled,
+            None => Compiled::new(&self.gpu, &sizes)?,
+        };
+        self.field = Some((extent, Learner::new(&self.gpu, &self.options, sizes, compiled)?));
         self.n_hinted = 0;
         Ok(())
     }
@@ -218,8 +234,11 @@ impl Method for NerfModel {
         Ok(())
     }
 
-    /// What is compiled depends on the sizes that the keyframes of the first step ask for.
+    /// What is compiled depends on the sizes that the keyframes of the first step ask for; these are asked.
     fn prepare(&mut self) -> Result<(), Error> {
+        if self.field.is_none() && !self.images.is_empty() {
+            self.compiled = Some(Compiled::new(&self.gpu, &self.sizes()?.1)?);
+        }
         Ok(())
     }
 

@@ -1,6 +1,8 @@
 //! The stages of drawing and learning, as lists of passes.
 
-use super::buffers::{FieldBuffers, FieldMoments, FieldSlopes, Occupancy, RaySlot, SampleBuffers, StepBuffers};
+use super::buffers::{
+    FieldBuffers, FieldMoments, FieldSlopes, Occupancy, RaySlot, SampleBuffers, StepBuffers, n_blocks,
+};
 use super::kernels::{CHUNK_TILES, FieldPipelines, N_TILE};
 use super::params::Backdrop;
 use crate::Error;
@@ -100,14 +102,16 @@ impl FieldPasses<'_> {
     }
 
     /// Marks the cells that rays are walked through.
-    fn mark(&self, list: &mut Passes, occupancy: &Occupancy, moments: &FieldMoments) {
+    pub(crate) fn mark(&self, list: &mut Passes, occupancy: &Occupancy, moments: &FieldMoments) {
         let Self { gpu, pipelines, .. } = *self;
-        let Occupancy { occupied, thickness, thickness_sum, n_cells, .. } = occupancy;
+        let Occupancy { occupied, thickness, thickness_sum, visit, n_cells, .. } = occupancy;
         let (thickness, steps) = (("thickness", thickness), ("steps", &moments.steps));
         list.clear(thickness_sum);
         let (sum, of_words) = (("thickness_sum", thickness_sum), groups(n_cells.pow(3) / 32, 64));
         list.dispatch(gpu, &pipelines.sum_cells, of_words, &[thickness, sum]);
         list.dispatch(gpu, &pipelines.mark_cells, of_words, &[thickness, sum, ("occupied", occupied), steps]);
+        let n_words = n_blocks(*n_cells).pow(3).div_ceil(32);
+        list.dispatch(gpu, &pipelines.mark_blocks, groups(n_words, 64), &[("visit", visit), ("occupied", occupied)]);
     }
 
     /// Density of every point, before the exponential.

@@ -7,7 +7,7 @@ use crate::gpu::{f32_of, f32s_of};
 use crate::splat::depth_in_color_view;
 use nalgebra::Vector3;
 use rayon::prelude::*;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 /// Rays that one task draws.
 const RAYS_PER_TASK: usize = 512;
@@ -20,13 +20,17 @@ const END: f32 = 1e3;
 #[derive(Clone, Debug)]
 pub(crate) struct RayImage {
     pub(crate) keyframe: Arc<Keyframe>,
-    /// Of each pixel, metres along z; 0 where unknown; empty where there is none.
-    depth_m: Arc<[f32]>,
+    /// Of each pixel, metres along z; 0 where unknown; empty where there is none. Worked out when it is first asked for.
+    depth_m: OnceLock<Arc<[f32]>>,
 }
 
 impl RayImage {
     pub(crate) fn new(keyframe: Arc<Keyframe>) -> Self {
-        Self { depth_m: depth_in_color_view(&keyframe), keyframe }
+        Self { keyframe, depth_m: OnceLock::new() }
+    }
+
+    pub(crate) fn depth_m(&self) -> &[f32] {
+        self.depth_m.get_or_init(|| depth_in_color_view(&self.keyframe))
     }
 
     /// Origin, direction of length 1, and how far the depth says that the ray goes (0: it does not), in units of the
@@ -45,7 +49,7 @@ impl RayImage {
         }
         let pose = &self.keyframe.world_from_camera;
         let origin = (pose * nalgebra::Point3::from(origin_m)).coords - Vector3::from(extent.center_m);
-        let z_m = self.depth_m.get(pixel_ix).copied().filter(|z| z.is_finite()).unwrap_or(0.0);
+        let z_m = self.depth_m().get(pixel_ix).copied().filter(|z| z.is_finite()).unwrap_or(0.0);
         let length = in_camera.norm();
         let distance = f64::from(z_m) * length / extent.radius_m;
         ((origin / extent.radius_m).into(), (pose.rotation * (in_camera / length)).into(), distance.max(0.0))
