@@ -85,13 +85,17 @@ impl Occupancy {
     }
 }
 
+/// Threads that walk one ray, `SHARES` of `march_shares.wgsl`.
+pub(crate) const N_SHARES: u32 = 8;
+
 /// The rays of one step or of part of a picture, and how they are looked along.
 #[derive(Debug)]
 pub(crate) struct RaySlot {
     pub(crate) n_rays: u32,
     pub(crate) rays: Buffer,
-    /// Pieces found along each ray.
+    /// Pieces found along each ray; and, for each thread that looks for them, by those before it.
     pub(crate) n_found: Buffer,
+    pub(crate) n_before: Buffer,
     pub(crate) march: Buffer,
     pub(crate) loss: Buffer,
 }
@@ -102,6 +106,7 @@ impl RaySlot {
             n_rays,
             rays: gpu.storage("nerf.rays", u64::from(n_rays) * size_of::<Ray>() as u64)?,
             n_found: gpu.storage("nerf.n_found", 4 * u64::from(n_rays))?,
+            n_before: gpu.storage("nerf.n_before", 4 * u64::from(N_SHARES * n_rays))?,
             march: gpu.uniform_with("nerf.march", &<March as bytemuck::Zeroable>::zeroed()),
             loss: gpu.uniform_with("nerf.loss", &<RayLoss as bytemuck::Zeroable>::zeroed()),
         })

@@ -2,6 +2,7 @@
 
 use super::extent::Extent;
 use super::reference::march::March;
+use super::reference::space::largest;
 use crate::DepthMap;
 
 /// What is told of a cell, as in `hint_cells.wgsl`.
@@ -73,7 +74,8 @@ impl Cells {
     fn walk(&mut self, march: &March, (origin, direction): ([f64; 3], [f64; 3]), distance: f64) {
         let point = |t: f64| std::array::from_fn(|axis| origin[axis] + t * direction[axis]);
         let cell = |t: f64| march.cell(point(t)).0;
-        let width = |t: f64| 4.0 / march.n_cells as f64 * march.step_at(point(t)) / march.step;
+        // Of a cell, drawn in as it is.
+        let width = |t: f64| 4.0 / march.n_cells as f64 * largest(point(t)).1.max(1.0).powi(2);
         let is_open = distance == 0.0;
         let end = if is_open { NOWHERE } else { distance * (1.0 - OFF_FRAC) - width(distance) };
         let passed = if is_open { &mut self.without_end } else { &mut self.free };

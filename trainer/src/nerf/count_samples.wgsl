@@ -1,8 +1,8 @@
 // count_samples: how many pieces of each ray lie where something is.
 //
-// threads   one per ray
-// reads     batch, march, rays, occupied (a bit a cell)
-// writes    n_found [n_rays]
+// threads   8 per ray, each for a part of it
+// reads     batch, march, rays, occupied (a bit a cell, then a bit a block)
+// writes    n_found [n_rays], n_before [n_rays, 8] (those found by the threads before)
 // twin      nerf/reference/march.rs
 
 #import folded
@@ -10,23 +10,39 @@
 #import march_params
 #import space
 #import march
+#import march_shares
 
 @group(0) @binding(0) var<storage, read> batch: Batch;
 @group(0) @binding(1) var<uniform> march: March;
 @group(0) @binding(2) var<storage, read> rays: array<Ray>;
 @group(0) @binding(3) var<storage, read> occupied: array<u32>;
 @group(0) @binding(4) var<storage, read_write> n_found: array<u32>;
+@group(0) @binding(5) var<storage, read_write> n_before: array<u32>;
+
+var<workgroup> wg_found: array<u32, 64>;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
-    let ray_ix = folded(wg, n_wgs) * 64u + lane;
-    if ray_ix >= batch.n_rays { return; }
-    let ray = rays[ray_ix];
+    let ix = folded(wg, n_wgs) * 64u + lane;
+    let ray_ix = ix / SHARES;
+    let share = ix % SHARES;
     var n = 0u;
-    var walk = next_piece(march, ray, begin_of(march, ray));
-    while !walk.is_over && n < march.most_found {
-        n++;
-        walk = next_piece(march, ray, walk.t + walk.length);
+    if ray_ix < batch.n_rays {
+        let ray = rays[ray_ix];
+        let path = path_of(march, ray);
+        let range = share_of_pieces(path, share);
+        var piece = next_piece(march, ray, path, range.x, range.y);
+        while piece.ix < range.y {
+            n++;
+            piece = next_piece(march, ray, path, piece.ix + 1u, range.y);
+        }
     }
-    n_found[ray_ix] = n;
+    wg_found[lane] = n;
+    workgroupBarrier(); // All threads of a ray have counted.
+    if ray_ix < batch.n_rays {
+        var sum = 0u;
+        for (var other = lane - share; other < lane; other++) { sum += wg_found[other]; }
+        n_before[ix] = sum;
+        if share == SHARES - 1u { n_found[ray_ix] = sum + n; }
+    }
 }

@@ -2,7 +2,7 @@
 //
 // threads   one per ray
 // reads     march, occupied (a bit a cell)
-// writes    rays (first_sample, n_samples), found (n_samples, zero before), spans, points [n_samples] (middle of the sample, in the unit cube)
+// writes    rays (next_piece, first_sample, n_samples), found (n_samples, zero before), spans, points [n_samples] (middle of the sample, in the unit cube)
 // twin      nerf/reference/march.rs
 //
 // Where the samples of 256 rays lie depends on who comes first; what becomes of them does not.
@@ -39,11 +39,14 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     var ray: Ray;
     if ray_ix < batch.n_rays {
         ray = rays[ray_ix];
-        var walk = next_piece(march, ray, begin_of(march, ray));
-        while !walk.is_over && n < ROUND {
-            pieces[n] = vec2f(walk.t, walk.t + walk.length);
+        let path = path_of(march, ray);
+        let end_ix = select(path.n_pieces, 0u, ray.is_ended == 1u);
+        var piece = next_piece(march, ray, path, ray.next_piece, end_ix);
+        while piece.ix < end_ix && n < ROUND {
+            pieces[n] = vec2f(piece.begin, piece.end);
             n++;
-            walk = next_piece(march, ray, walk.t + walk.length);
+            rays[ray_ix].next_piece = piece.ix + 1u;
+            if n < ROUND { piece = next_piece(march, ray, path, piece.ix + 1u, end_ix); }
         }
     }
     var total: u32;

@@ -22,6 +22,7 @@ const SHARED: &[Source] = &[
     shared!("march_params"),
     shared!("space"),
     shared!("march"),
+    shared!("march_shares"),
     shared!("density"),
     shared!("sample"),
     shared!("scan"),
@@ -158,6 +159,15 @@ impl FieldPipelines {
         let sums = [("SUM_LANES", f64::from(most_weights / 16)), ("CHUNK_TILES", f64::from(CHUNK_TILES))];
         let hint = |kind: f64| Pipeline::new(gpu, kernel!("hint_cells"), &[("KIND", kind)]);
         let plain = |kernel: Kernel| Pipeline::new(gpu, kernel, &[]);
+        // These take long to compile.
+        let ((densities, colors), (learned, (field_backward, weight_slopes))) = rayon::join(
+            || rayon::join(|| forward(0.0, 0.0), || forward(1.0, 0.0)),
+            || {
+                let backward = || Pipeline::new(gpu, kernel!("field_backward"), &sizes);
+                let slopes = || Pipeline::new(gpu, kernel!("weight_slopes"), &with(&sums));
+                rayon::join(|| forward(1.0, 1.0), || rayon::join(backward, slopes))
+            },
+        );
         Ok(Self {
             count_samples: plain(kernel!("count_samples"))?,
             place_samples: Pipeline::new(gpu, kernel!("place_samples"), &[("CAPACITY", n_samples.into())])?,
@@ -171,12 +181,12 @@ impl FieldPipelines {
             mark_blocks: plain(kernel!("mark_blocks"))?,
             picture_rays: Pipeline::new(gpu, kernel!("picture_rays"), &[("NO_IMAGE", no_image.into())])?,
             show_rays: plain(kernel!("show_rays"))?,
-            densities: forward(0.0, 0.0)?,
-            colors: forward(1.0, 0.0)?,
-            forward: forward(1.0, 1.0)?,
+            densities: densities?,
+            colors: colors?,
+            forward: learned?,
             composite: plain(kernel!("composite"))?,
-            field_backward: Pipeline::new(gpu, kernel!("field_backward"), &sizes)?,
-            weight_slopes: Pipeline::new(gpu, kernel!("weight_slopes"), &with(&sums))?,
+            field_backward: field_backward?,
+            weight_slopes: weight_slopes?,
             learn_weights: Pipeline::new(gpu, kernel!("learn_weights"), &[("CHUNK", f64::from(N_CHUNK))])?,
             learn_grid: plain(kernel!("learn_grid"))?,
             end_step: plain(kernel!("end_step"))?,

@@ -7,7 +7,7 @@ use super::params::{Backdrop, Batch, LearnRule, March, Ray, RayLoss, Visit};
 use super::passes::{Canvas, FieldPasses};
 use super::rays::{mixed, unit};
 use super::reference::march as reference;
-use super::sizes::Sizes;
+use super::sizes::{LEAST_LEVELS, MOST_LEVELS, Sizes};
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
 use crate::splat::Camera;
 use crate::{Error, Picture};
@@ -40,6 +40,9 @@ const SPREAD_NEAR: f32 = 0.05;
 /// Scale of slopes at the start, before their sizes are known.
 const FIRST_SCALE: f32 = 1_048_576.0;
 
+/// Code of pictures that are of no image.
+const NO_IMAGE: u32 = 0;
+
 /// All that one field takes on the GPU.
 #[derive(Debug)]
 pub(crate) struct Learner {
@@ -57,30 +60,18 @@ pub(crate) struct Learner {
     passes: Passes,
 }
 
-/// Kernels for fields of some sizes.
+/// Kernels for all fields of an effort.
 #[derive(Debug)]
 pub(crate) struct Compiled {
     pipelines: FieldPipelines,
     widths: Widths,
-    n_samples: u32,
-    n_codes: u32,
 }
 
 impl Compiled {
-    pub(crate) fn new(gpu: &Gpu, sizes: &Sizes) -> Result<Self, Error> {
-        let (widths, n_samples, n_codes) = (widths_of(sizes), sizes.effort.n_samples, sizes.n_codes);
-        let pipelines = FieldPipelines::new(gpu, &widths, n_samples, n_codes - 1)?;
-        Ok(Self { pipelines, widths, n_samples, n_codes })
+    pub(crate) fn new(gpu: &Gpu, effort: &Effort) -> Result<Self, Error> {
+        let widths = Widths::new(effort.most_levels.clamp(LEAST_LEVELS, MOST_LEVELS), effort.n_hidden, 0);
+        Ok(Self { pipelines: FieldPipelines::new(gpu, &widths, effort.n_samples, NO_IMAGE)?, widths })
     }
-
-    pub(crate) fn is_for(&self, sizes: &Sizes) -> bool {
-        let Self { widths, n_samples, n_codes, .. } = self;
-        (widths, n_samples, n_codes) == (&widths_of(sizes), &sizes.effort.n_samples, &sizes.n_codes)
-    }
-}
-
-fn widths_of(sizes: &Sizes) -> Widths {
-    Widths::new(u32::try_from(sizes.n_cells.len()).expect("a few levels"), sizes.effort.n_hidden, 0)
 }
 
 impl Learner {
@@ -88,7 +79,7 @@ impl Learner {
     pub(crate) fn new(gpu: &Gpu, options: &NerfOptions, sizes: Sizes, compiled: Compiled) -> Result<Self, Error> {
         let Effort { n_rays, n_samples, n_cells, n_steps, .. } = sizes.effort;
         let shape = sizes.shape();
-        let Compiled { pipelines, widths, .. } = compiled;
+        let Compiled { pipelines, widths } = compiled;
         let field = FieldBuffers::new(gpu, &shape, &widths, sizes.n_codes)?;
         let slopes = FieldSlopes::new(gpu, &shape)?;
         gpu.write(&slopes.scales, 0, bytemuck::cast_slice(&vec![FIRST_SCALE; shape.n_cells.len()]));

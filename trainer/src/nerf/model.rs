@@ -115,9 +115,9 @@ impl NerfModel {
         log::debug!("nerf: {extent:?}, {sizes:?}");
         self.settle()?;
         self.field = None; // Its memory is free before the next one takes some.
-        let compiled = match self.compiled.take().filter(|compiled| compiled.is_for(&sizes)) {
+        let compiled = match self.compiled.take() {
             Some(compiled) => compiled,
-            None => Compiled::new(&self.gpu, &sizes)?,
+            None => Compiled::new(&self.gpu, &sizes.effort)?,
         };
         self.field = Some((extent, Learner::new(&self.gpu, &self.options, sizes, compiled)?));
         self.n_hinted = 0;
@@ -234,10 +234,9 @@ impl Method for NerfModel {
         Ok(())
     }
 
-    /// What is compiled depends on the sizes that the keyframes of the first step ask for; these are asked.
     fn prepare(&mut self) -> Result<(), Error> {
-        if self.field.is_none() && !self.images.is_empty() {
-            self.compiled = Some(Compiled::new(&self.gpu, &self.sizes()?.1)?);
+        if self.field.is_none() && self.compiled.is_none() {
+            self.compiled = Some(Compiled::new(&self.gpu, &self.effort())?);
         }
         Ok(())
     }

@@ -34,7 +34,7 @@ pub(crate) struct Ray {
     pub(crate) target_distance: f32,
     pub(crate) shift: f32,
     pub(crate) is_ended: u32,
-    pub(crate) unused: u32,
+    pub(crate) next_piece: u32,
 }
 
 /// `Span` of `shared/ray_batch.wgsl`.

@@ -1,7 +1,7 @@
 //! The stages of drawing and learning, as lists of passes.
 
 use super::buffers::{
-    FieldBuffers, FieldMoments, FieldSlopes, Occupancy, RaySlot, SampleBuffers, StepBuffers, n_blocks,
+    FieldBuffers, FieldMoments, FieldSlopes, N_SHARES, Occupancy, RaySlot, SampleBuffers, StepBuffers, n_blocks,
 };
 use super::kernels::{CHUNK_TILES, FieldPipelines, N_TILE};
 use super::params::Backdrop;
@@ -64,8 +64,9 @@ impl FieldPasses<'_> {
             ("rays", &slot.rays),
             ("occupied", &occupancy.occupied),
             ("n_found", &slot.n_found),
+            ("n_before", &slot.n_before),
         ];
-        list.dispatch(gpu, &pipelines.count_samples, groups(slot.n_rays, 64), &found);
+        list.dispatch(gpu, &pipelines.count_samples, groups(N_SHARES * slot.n_rays, 64), &found);
     }
 
     /// After [`FieldPasses::count`]: makes samples of the pieces.
@@ -74,8 +75,14 @@ impl FieldPasses<'_> {
         let shared =
             [("batch", &samples.batch), ("march", &slot.march), ("n_found", &slot.n_found), ("rays", &slot.rays)];
         list.dispatch(gpu, &pipelines.place_samples, 1, &shared);
-        let written = [("occupied", &occupancy.occupied), ("spans", &samples.spans), ("points", &samples.points)];
-        list.dispatch(gpu, &pipelines.write_samples, groups(slot.n_rays, 64), &[&shared[..], &written].concat());
+        let written = [
+            ("n_before", &slot.n_before),
+            ("occupied", &occupancy.occupied),
+            ("spans", &samples.spans),
+            ("points", &samples.points),
+        ];
+        let n_groups = groups(N_SHARES * slot.n_rays, 64);
+        list.dispatch(gpu, &pipelines.write_samples, n_groups, &[&shared[..], &written].concat());
     }
 
     /// Looks at some cells of the occupancy anew. What the batch held is lost.

@@ -2,7 +2,7 @@
 //
 // threads   one per ray
 // reads     batch, march (first_ray: the first pixel; most_found: samples of a round), view, backdrop, spans, told [n_samples], colors [n_samples]
-// writes    rays (begin of the next round; end), light [n_rays, 2] (rgb and transmittance; distance), pixels [n_pixels] (rgba8; a: coverage),
+// writes    rays (is_ended), light [n_rays, 2] (rgb and transmittance; distance), pixels [n_pixels] (rgba8; a: coverage),
 //           depths [n_pixels] (metres along z, mean over what is seen; 0 where nothing is)
 // twin      nerf/reference/ray.rs
 
@@ -54,13 +54,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     light[2u * ray_ix] = vec4f(rgb, transmittance);
     light[2u * ray_ix + 1u] = vec4f(distance, 0.0, 0.0, 0.0);
     let goes_on = ray.n_samples == march.most_found && transmittance > LEAST_TRANSMITTANCE;
-    rays[ray_ix].shift = 0.0;
-    if goes_on {
-        rays[ray_ix].begin = spans[end - 1u].end;
-    } else {
-        rays[ray_ix].end = ray.begin; // So that nothing more is found.
-        rays[ray_ix].is_ended = 1u;
-    }
+    if !goes_on { rays[ray_ix].is_ended = 1u; }
     let pixel_ix = march.first_ray + ray_ix;
     let pixel = ray_of_pixel(vec2u(pixel_ix % view.size_px.x, pixel_ix / view.size_px.x));
     let coverage = 1.0 - transmittance;

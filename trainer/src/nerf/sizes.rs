@@ -14,6 +14,9 @@ const GROWTH: f64 = 1.5;
 const PIXELS_PER_CELL: f64 = 1.5;
 /// Pixels of an image for each entry of a level: many images see the same place, and a surface is few of a level's cells.
 const PIXELS_PER_ENTRY: f64 = 0.5;
+/// Levels of any field.
+pub(crate) const LEAST_LEVELS: u32 = 4;
+pub(crate) const MOST_LEVELS: u32 = 16;
 const LEAST_LOG2_ENTRIES: u32 = 12;
 /// Bytes of an entry: itself, its slopes, its moments.
 const BYTES_PER_ENTRY: u64 = 8 + 8 + MOMENT_BYTES_PER_ENTRY;
@@ -47,7 +50,8 @@ impl Sizes {
         let finest = (4.0 * extent.radius_m / cell_m).clamp(64.0, 8192.0) as u32;
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few")]
         let n_levels = 1 + (f64::from(finest / COARSEST).ln() / GROWTH.ln()).ceil() as u32;
-        let n_levels = n_levels.next_multiple_of(2).clamp(4, effort.most_levels.clamp(4, 16));
+        let n_levels =
+            n_levels.next_multiple_of(2).clamp(LEAST_LEVELS, effort.most_levels.clamp(LEAST_LEVELS, MOST_LEVELS));
         let has_depth = keyframes.clone().any(|keyframe| keyframe.depth.is_some());
         let n_pixels = keyframes.map(|keyframe| keyframe.rgba_srgb.len() / 4).max().unwrap_or(0);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a logarithm")]
@@ -76,11 +80,12 @@ impl Sizes {
 
     /// Refuses sizes that no field has.
     pub(crate) fn check(&self) -> Result<(), Error> {
-        let Effort { n_rays, n_samples, n_hidden, n_cells, n_steps, picture_rays, .. } = self.effort;
+        let Effort { n_rays, n_samples, n_hidden, n_cells, n_steps, picture_rays, most_levels, .. } = self.effort;
         let rises = self.n_cells.windows(2).all(|pair| pair[0] <= pair[1]);
         let is_usable = (1..=16).contains(&self.n_cells.len())
             && self.n_cells.iter().all(|n| (1..=1 << 20).contains(n))
             && rises
+            && self.n_cells.len() <= most_levels.clamp(LEAST_LEVELS, MOST_LEVELS) as usize
             && (1..=28).contains(&self.log2_entries)
             && self.n_codes > 0
             && (1..=1 << 20).contains(&n_rays)

@@ -1,22 +1,51 @@
 // march: how a ray is walked through the parts of the scene that hold something. After `ray_batch`,
-// `march_params` and `space`.
+// `march_params`, `space` and `occupied` of the kernel.
 //
 // twin      nerf/reference/march.rs
 // source    occupancy: Mueller et al. 2022, appendix C; steps grow outside the inner cube as contraction shrinks them
+//
+// Pieces are numbered along the ray; where a piece lies follows from its number, so that several threads may walk one ray.
 
-const MOST_STEPS = 4096u;
 const FAR = 1e9;
 // Cells are told of one by one and, behind those, in blocks: so many along an axis.
 const MOST_BLOCKS = 16u;
 
-fn step_at(march: March, at: vec3f) -> f32 {
-    let size = abs(at);
-    let largest = max(1.0, max(size.x, max(size.y, size.z)));
-    return march.step * largest * largest;
+struct Path {
+    enter: f32,            // where the inner cube begins along the ray, or what is looked at
+    leave: f32,
+    n_before: f32,         // steps before the inner cube
+    n_inside: f32,
+    n_pieces: u32,
 }
 
-fn cell_in_occupancy(march: March, at: vec3f) -> vec3u {
-    return min(vec3u(contract(at) * f32(march.n_cells)), vec3u(march.n_cells - 1u));
+// Steps, as a share of all to infinity, that lead so far away from the inner cube: each is the longer the further out it lies.
+fn share_of(distance: f32) -> f32 { return 1.0 - 1.0 / (1.0 + distance); }
+fn distance_of(share: f32) -> f32 { return 1.0 / (1.0 - share) - 1.0; }
+
+fn path_of(march: March, ray: Ray) -> Path {
+    let direction = select(ray.direction, vec3f(1.0 / FAR), abs(ray.direction) < vec3f(1.0 / FAR));
+    let low = (-1.0 - ray.origin) / direction;
+    let high = (1.0 - ray.origin) / direction;
+    let near = min(low, high);
+    let far = max(low, high);
+    let enter = max(max(near.x, near.y), max(near.z, ray.begin));
+    let leave = min(far.x, min(far.y, far.z));
+    var path = Path(ray.begin, ray.begin, 0.0, 0.0, 0u);
+    if leave > enter { path = Path(enter, leave, share_of(enter - ray.begin) / march.step, (leave - enter) / march.step, 0u); }
+    // The last step to infinity is left out.
+    var n = path.n_before + path.n_inside + min(share_of(max(ray.end - path.leave, 0.0)) / march.step, 1.0 / march.step - 1.0);
+    if ray.end < path.leave { n = path.n_before + (ray.end - path.enter) / march.step; }
+    if ray.end < path.enter { n = path.n_before - share_of(path.enter - ray.end) / march.step; }
+    path.n_pieces = u32(clamp(ceil(n - ray.shift), 0.0, 1e6));
+    return path;
+}
+
+// Distance along the ray after so many steps.
+fn distance_at(march: March, path: Path, steps: f32) -> f32 {
+    if steps < path.n_before { return path.enter - distance_of((path.n_before - steps) * march.step); }
+    let inside = steps - path.n_before;
+    if inside < path.n_inside { return path.enter + inside * march.step; }
+    return path.leave + distance_of((inside - path.n_inside) * march.step);
 }
 
 fn bit_of(first_word: u32, n: u32, cell: vec3u) -> bool {
@@ -24,49 +53,41 @@ fn bit_of(first_word: u32, n: u32, cell: vec3u) -> bool {
     return (occupied[first_word + ix / 32u] >> (ix % 32u) & 1u) == 1u;
 }
 
-// Steps from `at` on whose middles surely lie in a box of the unit cube that holds nothing; one where the box reaches out of the inner
-// cube, inside of which the unit cube and the world differ by a factor alone and all steps are alike.
-fn n_empty_steps(march: March, at: vec3f, direction: vec3f, box: vec3u, n_boxes: u32) -> f32 {
+// Steps from `at` on, the first of which has its middle in an empty box of the unit cube, that all have it there; one where the box
+// reaches out of the inner cube, inside of which the unit cube and the world differ by a factor alone and all steps are alike.
+fn n_empty_steps(march: March, at: vec3f, direction: vec3f, box: vec3u, n_boxes: u32) -> u32 {
     let size = 4.0 / f32(n_boxes);
     let low = vec3f(box) * size - 2.0;
     let high = low + size;
-    if any(abs(at) > vec3f(1.0)) || any(low < vec3f(-1.0)) || any(high > vec3f(1.0)) { return 1.0; }
+    if any(abs(at) > vec3f(1.0)) || any(low < vec3f(-1.0)) || any(high > vec3f(1.0)) { return 1u; }
     let out = (select(low, high, direction > vec3f(0.0)) - at) / direction;
     let ends = select(out, vec3f(FAR), abs(direction) < vec3f(1e-6));
-    return max(1.0, floor(min(ends.x, min(ends.y, ends.z)) / march.step - 0.5));
+    return u32(clamp(min(ends.x, min(ends.y, ends.z)) / march.step - 0.5, 1.0, 4096.0));
 }
 
-// Where a walk stands: the next piece begins at `t`.
-struct Walk {
-    t: f32,
-    length: f32,           // of the piece that was found
-    is_over: bool,
+// A piece of a ray in a cell that holds something; `end_ix` where there is none before that.
+struct Piece {
+    ix: u32,
+    begin: f32,
+    end: f32,
 }
 
-// Walks on to the next piece in a cell that holds something; `t` is where it begins.
-fn next_piece(march: March, ray: Ray, from_t: f32) -> Walk {
-    var t = from_t;
-    for (var i = 0u; i < MOST_STEPS; i++) {
-        if !(t < ray.end) { break; }
-        let at = ray.origin + t * ray.direction;
-        let length = step_at(march, at);
-        let cell = cell_in_occupancy(march, at + 0.5 * length * ray.direction);
-        let block_cells = max(march.n_cells / MOST_BLOCKS, 1u);
-        let n_blocks = march.n_cells / block_cells;
-        let n_words = march.n_cells * march.n_cells * march.n_cells / 32u;
-        var n_steps: f32;
-        if !bit_of(n_words, n_blocks, cell / block_cells) {
-            n_steps = n_empty_steps(march, at, ray.direction, cell / block_cells, n_blocks);
-        } else if !bit_of(0u, march.n_cells, cell) {
-            n_steps = n_empty_steps(march, at, ray.direction, cell, march.n_cells);
-        } else {
-            return Walk(t, length, false);
-        }
-        t += n_steps * length;
+// The first such piece from number `from_ix` on.
+fn next_piece(march: March, ray: Ray, path: Path, from_ix: u32, end_ix: u32) -> Piece {
+    let block_cells = max(march.n_cells / MOST_BLOCKS, 1u);
+    let n_blocks = march.n_cells / block_cells;
+    let n_words = march.n_cells * march.n_cells * march.n_cells / 32u;
+    var ix = from_ix;
+    while ix < end_ix {
+        let begin = distance_at(march, path, f32(ix) + ray.shift);
+        let end = distance_at(march, path, f32(ix + 1u) + ray.shift);
+        let middle = contract(ray.origin + 0.5 * (begin + end) * ray.direction);
+        let cell = min(vec3u(middle * f32(march.n_cells)), vec3u(march.n_cells - 1u));
+        let block = cell / block_cells;
+        let block_is_empty = !bit_of(n_words, n_blocks, block);
+        if !block_is_empty && bit_of(0u, march.n_cells, cell) { return Piece(ix, begin, end); }
+        let at = ray.origin + begin * ray.direction;
+        ix += n_empty_steps(march, at, ray.direction, select(cell, block, block_is_empty), select(march.n_cells, n_blocks, block_is_empty));
     }
-    return Walk(t, 0.0, true);
-}
-
-fn begin_of(march: March, ray: Ray) -> f32 {
-    return ray.begin + ray.shift * step_at(march, ray.origin + ray.begin * ray.direction);
+    return Piece(end_ix, 0.0, 0.0);
 }

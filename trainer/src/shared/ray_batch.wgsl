@@ -19,10 +19,10 @@ struct Ray {
     target_distance: f32,   // along the ray; 0: unknown
     shift: f32,             // of its samples, in steps, 0 to 1
     is_ended: u32,          // 1: of a picture, and nothing more can be seen along it
-    unused: u32,
+    next_piece: u32,        // of a picture's ray: the first that was not looked for yet
 }
 
-// A piece of a ray.
+// A sample's part of a ray.
 struct Span {
     begin: f32,
     end: f32,

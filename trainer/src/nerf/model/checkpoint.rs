@@ -115,7 +115,7 @@ impl NerfModel {
         let mut model = Self::new(gpu, state.options.clone())?;
         if let Some((extent, sizes)) = &state.field {
             sizes.check()?;
-            let compiled = Compiled::new(&model.gpu, sizes)?;
+            let compiled = Compiled::new(&model.gpu, &sizes.effort)?;
             let learner = Learner::new(&model.gpu, &model.options, sizes.clone(), compiled)?;
             for (name, buffer) in buffers(&learner) {
                 model.gpu.write(buffer, 0, checkpoint.array(&name, buffer.bytes())?);

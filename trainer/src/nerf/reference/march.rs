@@ -2,7 +2,7 @@
 //!
 //! Source: occupancy of Mueller et al. 2022, appendix C; steps grow outside the inner cube as contraction shrinks them.
 
-use super::space::{contract, largest};
+use super::space::contract;
 
 /// How rays are walked; lengths in units of the scene's radius.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -24,12 +24,35 @@ pub struct Piece {
     pub length: f64,
 }
 
-impl March {
-    /// Length of the step that begins at a point.
-    pub fn step_at(&self, at: [f64; 3]) -> f64 {
-        self.step * largest(at).1.max(1.0).powi(2)
-    }
+/// Directions less steep than this along an axis count as that steep.
+const LEAST_SLOPE: f64 = 1e-9;
 
+/// How a ray goes through the inner cube, and in how many steps.
+#[derive(Clone, Copy, Debug)]
+struct Path {
+    enter: f64,
+    leave: f64,
+    n_before: f64,
+    n_inside: f64,
+    n_steps: f64,
+}
+
+impl Path {
+    /// Distance along the ray after so many steps.
+    fn distance_at(&self, step: f64, n: f64) -> f64 {
+        let distance_of = |share: f64| 1.0 / (1.0 - share) - 1.0;
+        let inside = n - self.n_before;
+        if inside < 0.0 {
+            self.enter - distance_of(-inside * step)
+        } else if inside < self.n_inside {
+            self.enter + inside * step
+        } else {
+            self.leave + distance_of((inside - self.n_inside) * step)
+        }
+    }
+}
+
+impl March {
     /// Number of the cell around a point, and how far the point is from the cell's nearest side, in cells.
     pub fn cell(&self, at: [f64; 3]) -> (usize, f64) {
         let scaled = contract(at).map(|x| x * self.n_cells as f64);
@@ -40,7 +63,10 @@ impl March {
     }
 
     /// All pieces of a ray between two distances, the first of them `shift` of a step behind `range[0]`; and the least margin
-    /// of any cell that was asked about.
+    /// of any cell that was asked about, and of the number of pieces.
+    ///
+    /// Steps are even inside the inner cube; outside, the step at a distance u from where the ray meets it is (1 + u)^2 as long, so
+    /// that 1 / (1 + u) changes by the same number with each.
     pub fn pieces(
         &self,
         (origin, direction): ([f64; 3], [f64; 3]),
@@ -48,19 +74,50 @@ impl March {
         shift: f64,
         is_occupied: impl Fn(usize) -> bool,
     ) -> (Vec<Piece>, f64) {
-        let point = |t: f64| std::array::from_fn(|axis| origin[axis] + t * direction[axis]);
-        let mut t = range[0] + shift * self.step_at(point(range[0]));
-        let (mut found, mut least_margin) = (Vec::new(), 1.0f64);
-        while t < range[1] {
-            let length = self.step_at(point(t));
-            let (cell, margin) = self.cell(point(t + 0.5 * length));
+        let path = self.path((origin, direction), range);
+        let middle = |piece: &Piece| {
+            std::array::from_fn(|axis| origin[axis] + (piece.begin + 0.5 * piece.length) * direction[axis])
+        };
+        let n_pieces = (path.n_steps - shift).ceil().max(0.0);
+        let to_whole = path.n_steps - shift - (path.n_steps - shift).round();
+        let (mut found, mut least_margin) = (Vec::new(), to_whole.abs());
+        let mut ix = 0.0;
+        while ix < n_pieces {
+            let [begin, end] = [ix, ix + 1.0].map(|ix| path.distance_at(self.step, ix + shift));
+            let piece = Piece { begin, length: end - begin };
+            let (cell, margin) = self.cell(middle(&piece));
             least_margin = least_margin.min(margin);
             if is_occupied(cell) {
-                found.push(Piece { begin: t, length });
+                found.push(piece);
             }
-            t += length;
+            ix += 1.0;
         }
         (found, least_margin)
+    }
+
+    fn path(&self, (origin, direction): ([f64; 3], [f64; 3]), [begin, end]: [f64; 2]) -> Path {
+        let [mut enter, mut leave] = [begin, f64::INFINITY];
+        for axis in 0..3 {
+            let along = if direction[axis].abs() < LEAST_SLOPE { LEAST_SLOPE } else { direction[axis] };
+            let [low, high] = [-1.0, 1.0].map(|side| (side - origin[axis]) / along);
+            enter = enter.max(low.min(high));
+            leave = leave.min(low.max(high));
+        }
+        let share_of = |distance: f64| 1.0 - 1.0 / (1.0 + distance);
+        let mut path = Path { enter: begin, leave: begin, n_before: 0.0, n_inside: 0.0, n_steps: 0.0 };
+        if leave > enter {
+            let n_before = share_of(enter - begin) / self.step;
+            path = Path { enter, leave, n_before, n_inside: (leave - enter) / self.step, n_steps: 0.0 };
+        }
+        path.n_steps = if end < path.enter {
+            path.n_before - share_of(path.enter - end) / self.step
+        } else if end < path.leave {
+            path.n_before + (end - path.enter) / self.step
+        } else {
+            let n_after = (share_of(end - path.leave) / self.step).min(1.0 / self.step - 1.0);
+            path.n_before + path.n_inside + n_after
+        };
+        path
     }
 
     /// The spans of the samples that are kept of the pieces: no more than `most_samples`, each standing for as many.

@@ -28,7 +28,7 @@ pub fn contract_backward(at: [f64; 3], upstream: [f64; 3]) -> [f64; 3] {
 }
 
 /// The axis of the largest coordinate, and its size.
-pub(super) fn largest(point: [f64; 3]) -> (usize, f64) {
+pub(crate) fn largest(point: [f64; 3]) -> (usize, f64) {
     let larger =
         |best: (usize, f64), axis: usize| if point[axis].abs() > best.1 { (axis, point[axis].abs()) } else { best };
     (0..3).fold((0, 0.0), larger)
