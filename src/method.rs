@@ -9,9 +9,9 @@ use std::sync::Arc;
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
 use trainer::nerf::{NerfModel, NerfOptions};
-use trainer::splat::{SplatOptions, SplatTrainer};
+use trainer::splat::{CameraChoice, SplatOptions, SplatTrainer};
 use trainer::tsdf::{TsdfModel, TsdfOptions};
-use trainer::{Keyframe, Method};
+use trainer::{Aligned, Keyframe, Make, Method};
 
 /// The scene models there are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -47,21 +47,39 @@ impl Kind {
     }
 
     /// A model that has seen nothing yet. Of the options a distance field has the memory it may take, a neural field also
-    /// seed and planned steps; what else they want to know they find in the keyframes.
+    /// seed and planned steps, and both alignment; what else they want to know they find in the keyframes.
     pub(crate) fn start(self, gpu: Arc<Gpu>, options: SplatOptions) -> anyhow::Result<Box<dyn Method>> {
-        match self {
-            Self::Splat => Ok(Box::new(SplatTrainer::new(gpu, options)?)),
-            Self::Tsdf => {
-                let options = TsdfOptions { max_bytes: options.max_bytes, ..TsdfOptions::default() };
-                Ok(Box::new(TsdfModel::new(gpu, options)?))
-            }
-            Self::Nerf => {
-                let SplatOptions { seed, max_bytes, n_planned_steps, .. } = options;
-                let options = NerfOptions { seed, max_bytes, n_planned_steps, ..NerfOptions::default() };
-                Ok(Box::new(NerfModel::new(gpu, options)?))
-            }
+        if self == Self::Splat {
+            return Ok(Box::new(SplatTrainer::new(gpu, options)?));
         }
+        let make = self.make(&gpu, &options);
+        if options.align == CameraChoice::default() {
+            return Ok(make()?);
+        }
+        Ok(Box::new(Aligned::new(make, options.align, gpu.is_software(), options.n_planned_steps)?))
     }
+
+    /// Makes models of this kind.
+    fn make(self, gpu: &Arc<Gpu>, options: &SplatOptions) -> Make {
+        let (gpu, options) = (gpu.clone(), options.clone());
+        Box::new(move || {
+            let gpu = gpu.clone();
+            Ok(match self {
+                Self::Splat => Box::new(SplatTrainer::new(gpu, options.clone())?),
+                Self::Tsdf => Box::new(TsdfModel::new(gpu, tsdf_options(&options))?),
+                Self::Nerf => Box::new(NerfModel::new(gpu, nerf_options(&options))?),
+            })
+        })
+    }
+}
+
+fn tsdf_options(options: &SplatOptions) -> TsdfOptions {
+    TsdfOptions { max_bytes: options.max_bytes, ..TsdfOptions::default() }
+}
+
+fn nerf_options(options: &SplatOptions) -> NerfOptions {
+    let SplatOptions { seed, max_bytes, n_planned_steps, .. } = *options;
+    NerfOptions { seed, max_bytes, n_planned_steps, ..NerfOptions::default() }
 }
 
 /// A model that goes on from a checkpoint.
@@ -76,20 +94,37 @@ pub(crate) struct Resumed {
 
 /// Goes on from a checkpoint; what was learned from must be among the keyframes.
 pub(crate) fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<Resumed> {
+    let usual = SplatOptions::default;
+    // What a model was made with is in its checkpoint; a new one is made the same way.
     if checkpoint.method == Kind::Tsdf.name() {
-        let (model, rest) = TsdfModel::resume(gpu, checkpoint, keyframes)?;
-        let options = SplatOptions { max_bytes: model.options().max_bytes, ..SplatOptions::default() };
-        return Ok(Resumed { kind: Kind::Tsdf, method: Box::new(model), options, rest });
+        let TsdfOptions { max_bytes, .. } = made_with(checkpoint)?;
+        let options = SplatOptions { max_bytes, ..usual() };
+        let (method, rest) =
+            Aligned::resume(checkpoint, keyframes, Kind::Tsdf.make(&gpu, &options), |own, keyframes| {
+                let (model, rest) = TsdfModel::resume(gpu.clone(), own, keyframes)?;
+                Ok((Box::new(model), rest))
+            })?;
+        return Ok(Resumed { kind: Kind::Tsdf, method, options, rest });
     }
     if checkpoint.method == Kind::Nerf.name() {
-        let (model, rest) = NerfModel::resume(gpu, checkpoint, keyframes)?;
-        let NerfOptions { seed, max_bytes, n_planned_steps, .. } = *model.options();
-        let options = SplatOptions { seed, max_bytes, n_planned_steps, ..SplatOptions::default() };
-        return Ok(Resumed { kind: Kind::Nerf, method: Box::new(model), options, rest });
+        let NerfOptions { seed, max_bytes, n_planned_steps, .. } = made_with(checkpoint)?;
+        let options = SplatOptions { seed, max_bytes, n_planned_steps, ..usual() };
+        let (method, rest) =
+            Aligned::resume(checkpoint, keyframes, Kind::Nerf.make(&gpu, &options), |own, keyframes| {
+                let (model, rest) = NerfModel::resume(gpu.clone(), own, keyframes)?;
+                Ok((Box::new(model), rest))
+            })?;
+        return Ok(Resumed { kind: Kind::Nerf, method, options, rest });
     }
     let (model, rest) = SplatTrainer::resume(gpu, checkpoint, keyframes)?;
     let options = model.options().clone();
     Ok(Resumed { kind: Kind::Splat, method: Box::new(model), options, rest })
+}
+
+/// The options of the model that a checkpoint is of.
+fn made_with<T: serde::de::DeserializeOwned>(checkpoint: &Checkpoint) -> anyhow::Result<T> {
+    let options = checkpoint.state.get("options").cloned().unwrap_or_default();
+    serde_json::from_value(options).context("the checkpoint does not say how its model was made")
 }
 
 /// The kind of model that a folder holds: what its `model.json` names, else what its files are; `None` where there is neither.
@@ -109,8 +144,8 @@ pub(crate) fn kind_in(folder: &Path) -> anyhow::Result<Option<Kind>> {
 /// A saved model: its folder, of any kind, or a file of splats.
 pub(crate) fn load(gpu: Arc<Gpu>, model: &Path) -> anyhow::Result<Box<dyn Method>> {
     match kind_in(model)? {
-        Some(Kind::Tsdf) => return Ok(Box::new(TsdfModel::load(gpu, model)?)),
-        Some(Kind::Nerf) => return Ok(Box::new(NerfModel::load(gpu, model)?)),
+        Some(Kind::Tsdf) => return Ok(Aligned::of_folder(Box::new(TsdfModel::load(gpu, model)?), model)?),
+        Some(Kind::Nerf) => return Ok(Aligned::of_folder(Box::new(NerfModel::load(gpu, model)?), model)?),
         Some(Kind::Splat) | None => {}
     }
     let splats = splat_file::read(model)?;

@@ -66,6 +66,7 @@ pub(crate) fn model(
         Evidence { joints: data.rig.is_some(), depth: data.keyframes.iter().any(|keyframe| keyframe.depth.is_some()) };
     let Refining { align, learn: cameras } =
         args.refining(evidence, if software { Refine::None } else { Refine::Auto })?;
+    args.check_learned(kind, evidence)?;
     let count = args.count(if software { HowMany::ToCap } else { HowMany::Tested });
     if let Some(rig) = &data.rig {
         let options = SplatOptions { cameras, align, count, ..method::options(&rig.train, steps)? };

@@ -79,17 +79,26 @@ pub(crate) struct Evidence {
 impl TrainingArgs {
     /// Refuses flags that only splats have where the scene model is another.
     pub(crate) fn check_for(&self, kind: Kind) -> Result<(), BadArgument> {
-        let of_splats = [
-            (self.max_splats.is_some(), "--max-splats"),
-            (!self.refine.is_empty(), "--refine"),
-            (self.count.is_some(), "--count"),
-        ];
+        let of_splats = [(self.max_splats.is_some(), "--max-splats"), (self.count.is_some(), "--count")];
         match of_splats.into_iter().find(|(is_given, _)| *is_given && kind != Kind::Splat) {
             Some((_, flag)) => {
                 Err(BadArgument(format!("{flag}: only the method splat has it, and the method is {}", kind.name())))
             }
             None => Ok(()),
         }
+    }
+
+    /// Refuses terms that were asked for and that only splats learn: those that come along with the scene.
+    pub(crate) fn check_learned(&self, kind: Kind, evidence: Evidence) -> Result<(), BadArgument> {
+        let can_align = |term: &Refine| evidence.depth && *term != Refine::ImageGains;
+        let is_left = |term: &Refine| matches!(term, Refine::Auto | Refine::None) || can_align(term);
+        if kind == Kind::Splat || self.refine.iter().all(is_left) {
+            return Ok(());
+        }
+        Err(BadArgument(format!(
+            "--refine: the method {} corrects cameras by laying images with depth over each other at the start, and no others",
+            kind.name()
+        )))
     }
 
     /// What is found about cameras; `usual` where no flag says.

@@ -103,6 +103,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let rig = Rig::load(&args.rig_file, &args.overrides())?;
     let kind = Kind::of_rig(&rig)?;
     args.training.check_for(kind)?;
+    let evidence = Evidence { joints: true, depth: false }; // Depth comes, but not at the start.
+    args.training.check_learned(kind, evidence)?;
     let pace = args.pace(&rig)?;
     let hub = Hub::new();
     let server = Server::start(ServerConfig { listen: args.listen }, hub.clone())?;
@@ -114,7 +116,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let feed = Feed::start(args.input(&rig, source)?, hub.clone(), stop.clone())?;
     let gpu = super::open_gpu()?;
     let notes = notes(&gpu);
-    let evidence = Evidence { joints: true, depth: false }; // Depth comes, but not at the start.
     let cameras = args.training.refining(evidence, Refine::None)?.learn;
     let count = args.training.count(HowMany::ToCap);
     let options = SplatOptions { cameras, count, ..method::options(&rig.train, args.steps)? };

@@ -1,6 +1,7 @@
 //! Radiance fields trained on wgpu: keyframes in, pictures out.
 
 pub mod align;
+mod aligned;
 pub mod checkpoint;
 mod error;
 pub mod eval;
@@ -26,6 +27,7 @@ mod test_scenes;
 
 pub mod tsdf;
 
+pub use aligned::{Aligned, Make};
 pub use error::Error;
 pub use keyframe::{DepthMap, Keyframe, Split, Truth};
 pub use method::{Method, Part, Progress};

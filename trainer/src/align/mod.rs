@@ -7,6 +7,7 @@
 //!
 //! Pure functions of keyframes: no clock, no I/O, and sums in a fixed order however many threads there are.
 
+mod beside;
 mod corrections;
 mod fit;
 mod frame;
@@ -22,6 +23,7 @@ mod sums;
 pub(crate) mod tests;
 mod view;
 
+pub(crate) use beside::{Aligning, taken_at};
 pub use report::{Alignment, Found, Moved, Number, Unseen};
 
 use crate::splat::{CameraChoice, Candidate, TermSet, Trial};

@@ -27,34 +27,55 @@
 // One contribution is at most this: 2^7 of them fit into a sum.
 const MOST = 16777216.0;
 const NOT_CUT = 0xffffffffu;
-const NOT_KEPT = 0xffffffffu;
+const N_OF_COLOR = 3u;             // layers of the second network
+const N_LAYERS = 5u;
 
 fn keep(tile: u32, row: u32, part: u32, value: vec4f) {
     v_held[(tile * n_slope_rows() + row) * PARTS + part] = value;
 }
 
-// Slopes towards the inputs of a layer, from rows of a bank to rows of the other; zero where the input was cut.
-fn layer(from_bank: u32, first_weight: u32, n_in: u32, n_out: u32, cut_row: u32, kept_row: u32, tile: u32, lane: u32) {
+struct Layer {
+    from_bank: u32,
+    first_weight: u32,
+    n_in: u32,
+    n_out: u32,
+    cut_row: u32,          // what came in, which was cut at zero; NOT_CUT: it was not
+    kept_row: u32,
+}
+
+// From the last one on.
+fn layer_of(ix: u32) -> Layer {
+    switch ix {
+        case 0u: { return Layer(0u, color_weights(), N_HIDDEN, N_COLORS, hidden_2_row(), v_hidden_2_row()); }
+        case 1u: { return Layer(BANK, hidden_2_weights(), N_HIDDEN, N_HIDDEN, hidden_1_row(), v_hidden_1_row()); }
+        case 2u: { return Layer(0u, hidden_1_weights(), N_COLOR_IN, N_HIDDEN, NOT_CUT, 0u); }
+        case 3u: { return Layer(0u, told_weights(), N_HIDDEN, N_TOLD, hidden_0_row(), 0u); }
+        default: { return Layer(BANK, 0u, N_FEATURES, N_HIDDEN, NOT_CUT, 0u); }
+    }
+}
+
+// Slopes towards the inputs of a layer, from rows of a bank to rows of the other.
+fn work_out(layer: Layer, tile: u32, lane: u32) {
     let part = lane % PARTS;
-    let n_words = n_in / 4u;
+    let n_words = layer.n_in / 4u;
     for (var group = lane / PARTS; group < n_words; group += LANES / PARTS) {
         var sums: mat4x4f; // a column a row
-        for (var j = 0u; j < n_out; j += 4u) {
-            let at = from_bank + j * STRIDE + part;
+        for (var j = 0u; j < layer.n_out; j += 4u) {
+            let at = layer.from_bank + j * STRIDE + part;
             let v = mat4x4f(wg_rows[at], wg_rows[at + STRIDE], wg_rows[at + 2u * STRIDE], wg_rows[at + 3u * STRIDE]);
-            let row = first_weight + j * n_words + group;
+            let row = layer.first_weight + j * n_words + group;
             let w = mat4x4f(weights[row], weights[row + n_words], weights[row + 2u * n_words], weights[row + 3u * n_words]);
             sums += v * transpose(w);
         }
         for (var i = 0u; i < 4u; i++) {
             var sum = sums[i];
             let row = 4u * group + i;
-            if cut_row != NOT_CUT {
-                let was = held[(tile * n_held_rows() + cut_row + row) * PARTS + part];
+            if layer.cut_row != NOT_CUT {
+                let was = held[(tile * n_held_rows() + layer.cut_row + row) * PARTS + part];
                 sum = select(vec4f(0.0), sum, was > vec4f(0.0));
+                keep(tile, layer.kept_row + row, part, sum);
             }
-            wg_rows[(BANK - from_bank) + row * STRIDE + part] = sum;
-            if kept_row != NOT_KEPT { keep(tile, kept_row + row, part, sum); }
+            wg_rows[(BANK - layer.from_bank) + row * STRIDE + part] = sum;
         }
     }
     workgroupBarrier(); // The rows are there before the next layer reads them, and this one has read what that overwrites.
@@ -141,12 +162,11 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let tile = folded(wg, n_wgs);
     if tile * TILE < batch.n_samples {
         color_slopes(tile, lane);
-        layer(0u, color_weights(), N_HIDDEN, N_COLORS, hidden_2_row(), v_hidden_2_row(), tile, lane);
-        layer(BANK, hidden_2_weights(), N_HIDDEN, N_HIDDEN, hidden_1_row(), v_hidden_1_row(), tile, lane);
-        layer(0u, hidden_1_weights(), N_COLOR_IN, N_HIDDEN, NOT_CUT, NOT_KEPT, tile, lane);
-        told_slopes(tile, lane);
-        layer(0u, told_weights(), N_HIDDEN, N_TOLD, hidden_0_row(), 0u, tile, lane);
-        layer(BANK, 0u, N_FEATURES, N_HIDDEN, NOT_CUT, NOT_KEPT, tile, lane);
+        // A loop, so that the code of a layer is there once: it is long.
+        for (var ix = 0u; ix < N_LAYERS; ix++) {
+            if ix == N_OF_COLOR { told_slopes(tile, lane); }
+            work_out(layer_of(ix), tile, lane);
+        }
         scatter(tile, lane);
     }
 }

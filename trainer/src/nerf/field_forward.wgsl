@@ -31,6 +31,8 @@ override COLORS: bool;
 override KEEPS: bool;
 
 const NOT_KEPT = 0xffffffffu;
+const N_OF_DENSITY = 2u;           // layers of the first network
+const N_LAYERS = 5u;
 
 struct ShSums {
     sample: u32,
@@ -81,24 +83,44 @@ fn look_up(tile: u32, lane: u32) {
     }
 }
 
+struct Layer {
+    from_bank: u32,
+    first_weight: u32,
+    n_in: u32,
+    n_out: u32,
+    kept_row: u32,         // NOT_KEPT: the last of its network, which is not cut at zero
+}
+
+fn layer_of(ix: u32) -> Layer {
+    switch ix {
+        case 0u: { return Layer(0u, 0u, N_FEATURES, N_HIDDEN, hidden_0_row()); }
+        case 1u: { return Layer(BANK, told_weights(), N_HIDDEN, N_TOLD, NOT_KEPT); }
+        case 2u: { return Layer(BANK, hidden_1_weights(), N_COLOR_IN, N_HIDDEN, hidden_1_row()); }
+        case 3u: { return Layer(0u, hidden_2_weights(), N_HIDDEN, N_HIDDEN, hidden_2_row()); }
+        default: { return Layer(BANK, color_weights(), N_HIDDEN, N_COLORS, NOT_KEPT); }
+    }
+}
+
 // One layer, from rows of a bank to rows of the other.
-fn layer(from_bank: u32, first_weight: u32, n_in: u32, n_out: u32, is_cut: bool, kept_row: u32, tile: u32, lane: u32) {
+fn work_out(layer: Layer, tile: u32, lane: u32) {
     let part = lane % PARTS;
-    let n_words = n_in / 4u;
-    for (var group = lane / PARTS; group < n_out / 4u; group += LANES / PARTS) {
-        let row = first_weight + 4u * group * n_words;
+    let n_words = layer.n_in / 4u;
+    for (var group = lane / PARTS; group < layer.n_out / 4u; group += LANES / PARTS) {
+        let row = layer.first_weight + 4u * group * n_words;
         var sums: mat4x4f; // a column a row
         for (var k = 0u; k < n_words; k++) {
-            let at = from_bank + 4u * k * STRIDE + part;
+            let at = layer.from_bank + 4u * k * STRIDE + part;
             let x = mat4x4f(wg_rows[at], wg_rows[at + STRIDE], wg_rows[at + 2u * STRIDE], wg_rows[at + 3u * STRIDE]);
             let w = mat4x4f(weights[row + k], weights[row + n_words + k], weights[row + 2u * n_words + k], weights[row + 3u * n_words + k]);
             sums += x * w;
         }
         for (var j = 0u; j < 4u; j++) {
             var sum = sums[j];
-            if is_cut { sum = max(sum, vec4f(0.0)); }
-            wg_rows[(BANK - from_bank) + (4u * group + j) * STRIDE + part] = sum;
-            if KEEPS && kept_row != NOT_KEPT { keep(tile, kept_row + 4u * group + j, part, sum); }
+            if layer.kept_row != NOT_KEPT {
+                sum = max(sum, vec4f(0.0));
+                if KEEPS { keep(tile, layer.kept_row + 4u * group + j, part, sum); }
+            }
+            wg_rows[(BANK - layer.from_bank) + (4u * group + j) * STRIDE + part] = sum;
         }
     }
     workgroupBarrier(); // The rows are there before the next layer reads them, and this one has read what that overwrites.
@@ -133,16 +155,17 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     if tile * TILE < batch.n_samples {
         look_up(tile, lane);
         workgroupBarrier(); // The features are there before the first layer reads them.
-        layer(0u, 0u, N_FEATURES, N_HIDDEN, true, hidden_0_row(), tile, lane);
-        layer(BANK, told_weights(), N_HIDDEN, N_TOLD, false, NOT_KEPT, tile, lane);
-        for (var sample = lane; sample < TILE; sample += LANES) {
-            if tile * TILE + sample < batch.n_samples { told[tile * TILE + sample] = wg_rows[sample / 4u][sample % 4u]; }
+        // A loop, so that the code of a layer is there once: it is long.
+        for (var ix = 0u; ix < select(N_OF_DENSITY, N_LAYERS, COLORS); ix++) {
+            if ix == N_OF_DENSITY { color_inputs(tile, lane); }
+            work_out(layer_of(ix), tile, lane);
+            if ix + 1u == N_OF_DENSITY {
+                for (var sample = lane; sample < TILE; sample += LANES) {
+                    if tile * TILE + sample < batch.n_samples { told[tile * TILE + sample] = wg_rows[sample / 4u][sample % 4u]; }
+                }
+            }
         }
         if COLORS {
-            color_inputs(tile, lane);
-            layer(BANK, hidden_1_weights(), N_COLOR_IN, N_HIDDEN, true, hidden_1_row(), tile, lane);
-            layer(0u, hidden_2_weights(), N_HIDDEN, N_HIDDEN, true, hidden_2_row(), tile, lane);
-            layer(BANK, color_weights(), N_HIDDEN, N_COLORS, false, NOT_KEPT, tile, lane);
             for (var sample = lane; sample < TILE; sample += LANES) {
                 let at = sample / 4u;
                 let i = sample % 4u;

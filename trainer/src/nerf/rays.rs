@@ -16,6 +16,11 @@ const TRIES: u64 = 4;
 /// Where rays end: far beyond this the field tells nothing apart.
 const END: f32 = 1e3;
 
+/// So far behind a reading, in units of the radius and as a share of its distance, a ray is still looked along: what lies further
+/// back it says nothing about.
+const BEHIND: f64 = 0.03;
+const BEHIND_FRAC: f64 = 0.03;
+
 /// A keyframe that rays are drawn from.
 #[derive(Clone, Debug)]
 pub(crate) struct RayImage {
@@ -63,7 +68,7 @@ impl RayImage {
             origin: f32s_of(origin),
             direction: f32s_of(direction),
             begin,
-            end: END,
+            end: if distance > 0.0 { f32_of(distance * (1.0 + BEHIND_FRAC) + BEHIND) } else { END },
             target_rgb: u32::from_le_bytes([pixel[0], pixel[1], pixel[2], pixel[3]]),
             target_distance: f32_of(distance),
             shift,

@@ -1,87 +1,14 @@
-//! Alignment beside training: begun with the first step on a thread of its own, taken at a fixed step.
-//!
-//! Where it keeps something the keyframes are corrected and training begins anew: splats learned from wrong poses would
+//! Where alignment keeps something the keyframes are corrected and training begins anew: splats learned from wrong poses would
 //! have to be unlearned.
 
 use super::SplatTrainer;
+use crate::Error;
 use crate::align::{self, Alignment};
 use crate::splat::buffers::SplatBuffers;
-use crate::splat::camera_terms::{CameraFix, CameraTerms, PosedLens, TermSet};
+use crate::splat::camera_terms::{CameraTerms, TermSet};
 use crate::splat::params::status;
 use crate::splat::seed::Seeder;
-use crate::splat::trials::CameraChoice;
 use crate::splat::views::TrainView;
-use crate::{Error, Keyframe};
-use std::sync::Arc;
-use std::thread::JoinHandle;
-
-/// The step at which the result is taken, waiting for it where needed: on a processor steps are as dear as alignment.
-const TAKEN_AT: u64 = 400;
-const TAKEN_AT_ON_SOFTWARE: u64 = 50;
-
-/// Where alignment stands.
-#[derive(Debug)]
-pub(super) enum Aligning {
-    /// It begins with the next step.
-    Asked,
-    Running(JoinHandle<Option<Alignment>>),
-    /// With what came of it, where it could be done.
-    Done(Option<Alignment>),
-}
-
-impl Aligning {
-    pub(super) fn new(choice: &CameraChoice) -> Self {
-        let is_asked = match choice {
-            CameraChoice::Given(terms) => terms.any(),
-            CameraChoice::Try(candidates) => !candidates.is_empty(),
-        };
-        if is_asked { Self::Asked } else { Self::Done(None) }
-    }
-
-    pub(super) fn result(&self) -> Option<&Alignment> {
-        match self {
-            Self::Done(result) => result.as_ref(),
-            Self::Asked | Self::Running(_) => None,
-        }
-    }
-
-    pub(super) fn is_done(&self) -> bool {
-        matches!(self, Self::Done(_))
-    }
-
-    fn fix(&self, camera: &str) -> Option<&CameraFix> {
-        self.result()?.fixes.get(camera)
-    }
-
-    /// The keyframe with what alignment found; the same where that is nothing.
-    pub(super) fn corrected(&self, keyframe: &Arc<Keyframe>) -> Arc<Keyframe> {
-        match self.fix(&keyframe.camera) {
-            Some(fix) => Arc::new(fix.corrected(keyframe)),
-            None => keyframe.clone(),
-        }
-    }
-
-    /// The camera of a keyframe with what alignment found and then what was learned with the splats.
-    pub(super) fn posed_lens(&self, keyframe: &Keyframe, learned: Option<&CameraFix>) -> PosedLens {
-        let posed = |keyframe: &Keyframe| learned.map_or_else(|| PosedLens::of(keyframe), |fix| fix.apply(keyframe));
-        match self.fix(&keyframe.camera) {
-            Some(fix) => PosedLens {
-                color_from_depth: keyframe.depth.as_ref().map(|depth| fix.color_from_depth(keyframe, depth)),
-                ..posed(&fix.corrected(&Keyframe { depth: None, ..keyframe.clone() }))
-            },
-            None => posed(keyframe),
-        }
-    }
-}
-
-/// Aligns on threads of its own: training, which makes images smaller on all processors, is not to wait for it.
-fn beside_training(keyframes: &[Arc<Keyframe>], choice: &CameraChoice) -> Option<Alignment> {
-    let n_processors = std::thread::available_parallelism().map_or(1, usize::from);
-    match rayon::ThreadPoolBuilder::new().num_threads((3 * n_processors).div_ceil(4)).build() {
-        Ok(pool) => pool.install(|| align::align(keyframes, choice)),
-        Err(_) => align::align(keyframes, choice),
-    }
-}
 
 impl SplatTrainer {
     /// Steps that may be taken before alignment is due.
@@ -90,32 +17,21 @@ impl SplatTrainer {
     }
 
     fn aligned_at(&self) -> u64 {
-        let usual = if self.gpu.is_software() { TAKEN_AT_ON_SOFTWARE } else { TAKEN_AT };
-        usual.min(self.options.n_planned_steps / 4).max(1)
+        align::taken_at(self.gpu.is_software(), self.options.n_planned_steps)
     }
 
     /// Begins alignment, or takes its result.
     pub(super) fn align_when_due(&mut self) -> Result<(), Error> {
-        if matches!(self.aligning, Aligning::Asked) {
+        if self.aligning.is_asked() {
             let views = self.views.iter().map(|view| view.keyframe.clone());
             let held_back = self.trials.held_back.iter().map(|held_back| held_back.keyframe.clone());
-            let keyframes: Vec<Arc<Keyframe>> = views.chain(held_back).collect();
-            let choice = self.options.align.clone();
-            self.aligning = Aligning::Running(std::thread::spawn(move || beside_training(&keyframes, &choice)));
+            self.aligning.begin(views.chain(held_back).collect(), &self.options.align);
         }
         if self.step < self.aligned_at() || self.aligning.is_done() {
             return Ok(());
         }
-        if let Aligning::Running(thread) = std::mem::replace(&mut self.aligning, Aligning::Done(None)) {
-            let result = thread.join().map_err(|_| Error::AlignmentPanicked)?;
-            for line in result.iter().flat_map(Alignment::lines) {
-                log::info!("{line}");
-            }
-            let is_any = result.as_ref().is_some_and(Alignment::is_any);
-            self.aligning = Aligning::Done(result);
-            if is_any {
-                self.begin_anew()?;
-            }
+        if self.aligning.finish()? {
+            self.begin_anew()?;
         }
         Ok(())
     }

@@ -1,8 +1,7 @@
 //! The state of a splat model in training: all that decides how it goes on, bit for bit.
 
 use super::SplatTrainer;
-use super::aligning::Aligning;
-use crate::align::Alignment;
+use crate::align::{Aligning, Alignment};
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::gpu::{Gpu, PendingRead};
 use crate::seen::{self, Seen};
