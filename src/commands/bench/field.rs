@@ -36,6 +36,8 @@ struct Row {
     samples: u32,
     step_ms: f64,
     step_wall_ms: f64,
+    /// Of as many samples of a picture.
+    colors_ms: f64,
     peak_mb: u64,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     passes: Vec<(&'static str, f64)>,
@@ -59,6 +61,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             samples: figures.n_samples,
             step_ms: figures.step_millis,
             step_wall_ms: figures.step_wall_millis,
+            colors_ms: figures.colors_millis,
             peak_mb: figures.peak_bytes >> 20,
             passes: if args.profile {
                 figures.passes.iter().map(|pass| (pass.name, pass.millis)).collect()
@@ -71,8 +74,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             continue;
         }
         print::line(format_args!(
-            "{} rays {:>8} samples: step {:.3} ms (wall {:.3}), peak {} MB",
-            row.rays, row.samples, row.step_ms, row.step_wall_ms, row.peak_mb
+            "{} rays {:>8} samples: step {:.3} ms (wall {:.3}), as many of a picture {:.3} ms, peak {} MB",
+            row.rays, row.samples, row.step_ms, row.step_wall_ms, row.colors_ms, row.peak_mb
         ))?;
         for (name, millis) in &row.passes {
             print::line(format_args!("    {millis:>9.4} ms  {name}"))?;

@@ -30,6 +30,8 @@ pub struct StepFigures {
     pub step_millis: f64,
     /// Wall time of a step, mean of a row of them back to back, milliseconds.
     pub step_wall_millis: f64,
+    /// GPU time of the colors of as many samples of a picture, milliseconds, median; wall time where there are no timestamps.
+    pub colors_millis: f64,
     /// GPU time of each pass of one step; empty without timestamps.
     pub passes: Vec<PassTiming>,
     /// Most bytes of GPU buffers alive at once.
@@ -67,22 +69,30 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
         None => Vec::new(),
     };
     let step_wall_millis = since.elapsed().as_secs_f64() * 1e3 / (n_submits * STEPS_PER_SUBMIT) as f64;
-    let mut timed = Vec::new();
-    for _ in 0..n_repeats.max(1) {
-        learner.record_step(gpu, &options, 0, STEP, &rays)?;
-        let since = Instant::now();
-        let passes = learner.submit_timed(gpu)?;
-        let wall = since.elapsed().as_secs_f64() * 1e3;
-        let sum = if passes.is_empty() { wall } else { passes.iter().map(|pass| pass.millis).sum() };
-        timed.push((sum, passes));
-    }
-    timed.sort_by(|(a, _), (b, _)| a.total_cmp(b));
-    let (step_millis, passes) = timed.swap_remove(timed.len() / 2);
+    let timed = |learner: &mut Learner, list: &dyn Fn(&mut Learner) -> Result<(), Error>| {
+        let mut timed = Vec::new();
+        for _ in 0..n_repeats.max(1) {
+            list(learner)?;
+            let since = Instant::now();
+            let passes = learner.submit_timed(gpu)?;
+            let wall = since.elapsed().as_secs_f64() * 1e3;
+            let sum = if passes.is_empty() { wall } else { passes.iter().map(|pass| pass.millis).sum() };
+            timed.push((sum, passes));
+        }
+        timed.sort_by(|(a, _), (b, _)| a.total_cmp(b));
+        Ok(timed.swap_remove(timed.len() / 2))
+    };
+    let (step_millis, passes) = timed(&mut learner, &|learner| learner.record_step(gpu, &options, 0, STEP, &rays))?;
+    let (colors_millis, _) = timed(&mut learner, &|learner| {
+        learner.record_colors(gpu);
+        Ok(())
+    })?;
     Ok(StepFigures {
         n_rays,
         n_samples: taken.get(1).copied().unwrap_or(0),
         step_millis,
         step_wall_millis,
+        colors_millis,
         passes,
         peak_bytes: gpu.peak_bytes(),
     })

@@ -4,6 +4,7 @@ use super::extent::Extent;
 use super::reference::march::March;
 use super::reference::space::largest;
 use crate::DepthMap;
+use rayon::prelude::*;
 
 /// What is told of a cell, as in `hint_cells.wgsl`.
 const LOOKED_AT_WITHOUT_END: u32 = 0;
@@ -14,7 +15,7 @@ const NOWHERE: f64 = 50.0;
 /// Share of the distance that a reading may be off by: so far in front of it nothing is taken for free.
 const OFF_FRAC: f64 = 0.03;
 
-/// Cells that an image looks at or through.
+/// Cells that images look at or through.
 #[derive(Debug)]
 struct Cells {
     without_end: CellSet,
@@ -35,41 +36,68 @@ impl CellSet {
         self.0[cell / 64] |= 1 << (cell % 64);
     }
 
+    fn extend(&mut self, other: &Self) {
+        self.0.iter_mut().zip(&other.0).for_each(|(own, others)| *own |= others);
+    }
+
     /// The cells that `other` has not got, in their order.
     fn without<'a>(&'a self, other: &'a Self) -> impl Iterator<Item = u32> + 'a {
-        let words = (0u32..).zip(self.0.iter().zip(&other.0)).map(|(ix, (own, others))| (ix, own & !others));
+        let others = other.0.iter().copied().chain(std::iter::repeat(0));
+        let words = (0u32..).zip(self.0.iter().zip(others)).map(|(ix, (own, others))| (ix, own & !others));
         words
             .filter(|(_, word)| *word != 0)
             .flat_map(|(ix, word)| (0..64).filter(move |bit| word >> bit & 1 == 1).map(move |bit| 64 * ix + bit))
     }
 }
 
-/// What a depth image tells about cells, each told once.
-pub(crate) fn hints(depth: &DepthMap, extent: &Extent, march: &March) -> Vec<u32> {
-    let cell_m = 4.0 * extent.radius_m / march.n_cells as f64;
-    // Rays that are half a cell apart a radius away.
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
-    let stride = (0.5 * cell_m / extent.radius_m * depth.focal_px[0]).clamp(1.0, 16.0) as u32;
-    let [without_end, free, surfaces, none] = [(); 4].map(|()| CellSet::new(march.n_cells.pow(3)));
-    let mut cells = Cells { without_end, free, surfaces };
-    let origin = extent.in_units(&depth.world_from_camera).translation.vector.into();
-    let [width, height] = depth.size_px;
-    for y in (0..height).step_by(stride as usize) {
-        for x in (0..width).step_by(stride as usize) {
-            let along = depth.point(x, y, 1.0);
-            let z_m = f64::from(depth.depth_m[(y * width + x) as usize]);
-            let reading_m = if z_m.is_finite() && z_m > 0.0 { z_m * along.norm() } else { 0.0 };
-            let direction = (depth.world_from_camera.rotation * along.normalize()).into();
-            cells.walk(march, (origin, direction), reading_m / extent.radius_m);
-        }
-    }
-    let Cells { without_end, free, surfaces } = &cells;
-    let without_end = without_end.without(&none).map(|cell| cell | LOOKED_AT_WITHOUT_END);
-    let free = free.without(surfaces).map(|cell| cell | LOOKED_THROUGH);
-    without_end.chain(free).chain(surfaces.without(&none).map(|cell| cell | SURFACE)).collect()
+/// What depth images tell about cells, each told once.
+pub(crate) fn hints(depths: &[&DepthMap], extent: &Extent, march: &March) -> Vec<u32> {
+    let none = || Cells::new(march.n_cells.pow(3));
+    let Cells { without_end, free, surfaces } = depths
+        .par_iter()
+        .fold(none, |mut cells, depth| {
+            cells.look(depth, extent, march);
+            cells
+        })
+        .reduce(none, Cells::and);
+    let without_end = without_end.without(&free).map(|cell| cell | LOOKED_AT_WITHOUT_END);
+    let free = free.without(&surfaces).map(|cell| cell | LOOKED_THROUGH);
+    let nothing = CellSet::new(0);
+    without_end.chain(free).chain(surfaces.without(&nothing).map(|cell| cell | SURFACE)).collect()
 }
 
 impl Cells {
+    fn new(n_cells: usize) -> Self {
+        let [without_end, free, surfaces] = [(); 3].map(|()| CellSet::new(n_cells));
+        Self { without_end, free, surfaces }
+    }
+
+    fn and(mut self, other: Self) -> Self {
+        self.without_end.extend(&other.without_end);
+        self.free.extend(&other.free);
+        self.surfaces.extend(&other.surfaces);
+        self
+    }
+
+    /// Takes note of a depth image.
+    fn look(&mut self, depth: &DepthMap, extent: &Extent, march: &March) {
+        let cell_m = 4.0 * extent.radius_m / march.n_cells as f64;
+        // Rays that are half a cell apart a radius away.
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
+        let stride = (0.5 * cell_m / extent.radius_m * depth.focal_px[0]).clamp(1.0, 16.0) as u32;
+        let origin = extent.in_units(&depth.world_from_camera).translation.vector.into();
+        let [width, height] = depth.size_px;
+        for y in (0..height).step_by(stride as usize) {
+            for x in (0..width).step_by(stride as usize) {
+                let along = depth.point(x, y, 1.0);
+                let z_m = f64::from(depth.depth_m[(y * width + x) as usize]);
+                let reading_m = if z_m.is_finite() && z_m > 0.0 { z_m * along.norm() } else { 0.0 };
+                let direction = (depth.world_from_camera.rotation * along.normalize()).into();
+                self.walk(march, (origin, direction), reading_m / extent.radius_m);
+            }
+        }
+    }
+
     /// Follows a ray to its reading; to nowhere where that is 0.
     fn walk(&mut self, march: &March, (origin, direction): ([f64; 3], [f64; 3]), distance: f64) {
         let point = |t: f64| std::array::from_fn(|axis| origin[axis] + t * direction[axis]);

@@ -11,6 +11,7 @@ use super::sizes::{LEAST_LEVELS, MOST_LEVELS, Sizes};
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
 use crate::splat::Camera;
 use crate::{Error, Picture};
+use rayon::prelude::*;
 
 /// Most steps of a submit: their rays lie on the GPU at once.
 pub(crate) const STEPS_PER_SUBMIT: usize = 8;
@@ -87,7 +88,7 @@ impl Learner {
         let n_points = (f64::from(n_cells.pow(3)) * VISITED_FRAC) as u32;
         let visit =
             Visit { n_cells, n_points: n_points.min(n_samples), kept_frac: KEPT_FRAC, step: 2.0 / n_steps as f32 };
-        let learner = Self {
+        let mut learner = Self {
             pipelines,
             moments: FieldMoments::new(gpu, &shape, &widths, &rule(options, 0.0))?,
             occupancy: Occupancy::new(gpu, &visit, sizes.has_depth)?,
@@ -105,6 +106,7 @@ impl Learner {
             sizes,
         };
         learner.fill(gpu, options.seed, &widths);
+        learner.arrange(gpu)?;
         Ok(learner)
     }
 
@@ -114,7 +116,8 @@ impl Learner {
         let uniform = |stream: u64, ix: usize, most: f64| {
             f32_of(most * (2.0 * unit(mixed(seed ^ mixed(stream << 40 | ix as u64))) - 1.0))
         };
-        let entries: Vec<f32> = (0..2 * self.field.n_entries as usize).map(|ix| uniform(1, ix, FIRST_ENTRY)).collect();
+        let n_numbers = 2 * self.field.n_entries as usize;
+        let entries: Vec<f32> = (0..n_numbers).into_par_iter().map(|ix| uniform(1, ix, FIRST_ENTRY)).collect();
         gpu.write(&self.field.grid, 0, bytemuck::cast_slice(&entries));
         let mut weights: Vec<f32> = Vec::new();
         for ([n_in, n_out], stream) in widths.layers().into_iter().zip(2..) {
@@ -122,6 +125,15 @@ impl Learner {
             weights.extend((0..(n_in * n_out) as usize).map(|at| uniform(stream, at, most)));
         }
         gpu.write(&self.field.weights, 0, bytemuck::cast_slice(&weights));
+    }
+
+    /// After the weights were given: makes the field fit to be looked at.
+    pub(crate) fn arrange(&mut self, gpu: &Gpu) -> Result<(), Error> {
+        self.make_slot(gpu, 0)?;
+        let Self { pipelines, field, samples, slots, passes: list, .. } = self;
+        FieldPasses { gpu, pipelines, field, samples, slot: &slots[0] }.arrange(list);
+        list.submit(gpu);
+        Ok(())
     }
 
     /// Bytes of what is learned, its slopes and moments.
@@ -179,6 +191,12 @@ impl Learner {
         passes.backward(list, kept, slopes);
         passes.learn(list, [&self.rules[0], &self.rules[1]], kept, slopes, moments);
         Ok(())
+    }
+
+    /// Lists the networks as pictures have them, for the samples of the last step.
+    pub(crate) fn record_colors(&mut self, gpu: &Gpu) {
+        let Self { pipelines, field, samples, slots, passes: list, .. } = self;
+        FieldPasses { gpu, pipelines, field, samples, slot: &slots[0] }.colors(list);
     }
 
     /// Sends what is listed; the read tells when it is done.

@@ -21,8 +21,6 @@ use std::time::Instant;
 
 /// GPU time that a submit may take, milliseconds.
 const MOST_SUBMIT_MILLIS: f64 = 20.0;
-/// Depth images whose hints lie on the GPU at once: a few megabytes.
-const DEPTHS_AT_ONCE: usize = 32;
 /// Nearest place that rays look at, in units of the scene's radius.
 const BEGIN: f32 = 0.03;
 
@@ -130,10 +128,7 @@ impl NerfModel {
         let march = learner.march();
         let depths: Vec<_> =
             self.images[self.n_hinted..].iter().filter_map(|image| image.keyframe.depth.as_ref()).collect();
-        for depths in depths.chunks(DEPTHS_AT_ONCE) {
-            let hints: Vec<_> = depths.par_iter().map(|depth| carve::hints(depth, extent, &march)).collect();
-            learner.hint(&self.gpu, &hints.concat())?;
-        }
+        learner.hint(&self.gpu, &carve::hints(&depths, extent, &march))?;
         self.n_hinted = self.images.len();
         Ok(())
     }

@@ -336,7 +336,7 @@ fn depth_tells_which_cells_are_empty_and_which_hold_something() {
     let depth = keyframes[0].depth.as_ref().unwrap();
     let extent = Extent { center_m: AT.into(), radius_m: 1.0 };
     let march = March { step: 1.0 / 32.0, most_samples: 64, n_cells: 32 };
-    let hints = carve::hints(depth, &extent, &march);
+    let hints = carve::hints(&[depth], &extent, &march);
     let told = |at: Point3<f64>| {
         let in_units: [f64; 3] = (at - AT).into();
         let cell = u32::try_from(march.cell(in_units).0).unwrap();
