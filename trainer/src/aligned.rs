@@ -139,19 +139,23 @@ impl Method for Aligned {
     }
 
     fn step(&mut self, n: u64) -> Result<u64, Error> {
-        if self.aligning.is_asked() && !self.model.is_idle() {
-            self.aligning.begin(self.given.clone(), &self.choice);
-        }
         let step = self.model.progress().step;
-        if !self.aligning.is_done() && (step >= self.taken_at || self.model.is_idle()) {
+        let is_running = !self.aligning.is_done() && !self.aligning.is_asked();
+        if is_running && (step >= self.taken_at || self.model.is_idle()) {
             self.settle()?;
         }
-        let left = if self.aligning.is_done() { u64::MAX } else { self.taken_at - self.model.progress().step };
-        self.model.step(n.min(left))
+        let left =
+            if self.aligning.is_done() { u64::MAX } else { self.taken_at.saturating_sub(self.model.progress().step) };
+        let n_steps = self.model.step(n.min(left))?;
+        // After the first step, which has much to do on the processor itself.
+        if self.aligning.is_asked() && n_steps > 0 {
+            self.aligning.begin(self.given.clone(), &self.choice);
+        }
+        Ok(n_steps)
     }
 
     fn is_idle(&self) -> bool {
-        self.model.is_idle() && (self.aligning.is_done() || self.aligning.is_asked())
+        self.model.is_idle() && (self.aligning.is_done() || self.model.progress().step == 0)
     }
 
     fn primitive(&self) -> &'static str {

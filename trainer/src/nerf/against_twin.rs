@@ -190,7 +190,6 @@ fn pictures_and_gradients_match_the_twin() {
         let Bench { gpu, pipelines, widths, field, samples: batch, step, slopes, slot } = &bench;
         let passes = FieldPasses { gpu, pipelines, field, samples: batch, slot };
         let mut list = Passes::default();
-        passes.arrange(&mut list);
         passes.forward(&mut list, step);
         passes.backward(&mut list, step, slopes);
         list.submit(gpu);
@@ -248,7 +247,6 @@ fn steps_of_learning_match_the_twin() {
         [vec![Moments::default(); twin.density.weights.len()], vec![Moments::default(); twin.color.weights.len()]];
     for step in 0..N_STEPS {
         let mut list = Passes::default();
-        passes.arrange(&mut list);
         passes.forward(&mut list, kept_step);
         passes.backward(&mut list, kept_step, slopes);
         passes.learn(&mut list, [&rules[0], &rules[1]], kept_step, slopes, &moments);
@@ -296,7 +294,6 @@ fn slopes_too_large_for_their_scale_are_counted_and_left_out() {
     let Bench { gpu, pipelines, field, samples, step, slopes, slot, .. } = &bench;
     let mut list = Passes::default();
     let passes = FieldPasses { gpu, pipelines, field, samples, slot };
-    passes.arrange(&mut list);
     passes.forward(&mut list, step);
     passes.backward(&mut list, step, slopes);
     list.submit(gpu);

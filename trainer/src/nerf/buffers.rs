@@ -14,8 +14,6 @@ pub(crate) struct FieldBuffers {
     pub(crate) grid: Buffer,
     /// Of all layers of both networks, `[outputs, inputs]` each.
     pub(crate) weights: Buffer,
-    /// The same as the way there reads them, see `arrange_weights.wgsl`.
-    pub(crate) arranged: Buffer,
     /// `[n_codes, n_code]`.
     pub(crate) codes: Buffer,
     /// What kernels bind and do not use.
@@ -153,7 +151,6 @@ impl FieldBuffers {
             levels: gpu.storage_with("nerf.levels", bytemuck::cast_slice(&levels))?,
             grid: gpu.storage("nerf.grid", 8 * u64::from(shape.n_entries_in_all()))?,
             weights: gpu.storage("nerf.weights", 4 * u64::from(widths.n_weights()))?,
-            arranged: gpu.storage("nerf.arranged", 4 * u64::from(widths.n_weights()))?,
             nothing: gpu.storage("nerf.nothing", 16)?,
             codes: gpu.storage("nerf.codes", 4 * u64::from(n_codes.max(1)) * u64::from(widths.n_code.max(1)))?,
             n_entries: shape.n_entries_in_all(),

@@ -1,7 +1,7 @@
 // field_forward: density and color of every sample, before the exponential and the sigmoid.
 //
 // threads   LANES per 32 samples
-// reads     batch, levels [n_levels], points [n_samples] (in the unit cube), grid [n_entries], arranged (see arrange_weights), rays, spans,
+// reads     batch, levels [n_levels], points [n_samples] (in the unit cube), grid [n_entries], weights, rays, spans,
 //           codes [n_images, N_CODE]
 // writes    told [n_samples] (logarithm of the density); where COLORS: colors [n_samples];
 //           where KEEPS: held [n_tiles, n_held_rows, 8] (vec4 of four samples)
@@ -18,7 +18,7 @@
 @group(0) @binding(1) var<storage, read> levels: array<Level>;
 @group(0) @binding(2) var<storage, read> points: array<vec4f>;
 @group(0) @binding(3) var<storage, read> grid: array<vec2f>;
-@group(0) @binding(4) var<storage, read> arranged: array<vec4f>;
+@group(0) @binding(4) var<storage, read> weights: array<vec4f>;
 @group(0) @binding(5) var<storage, read> rays: array<Ray>;
 @group(0) @binding(6) var<storage, read> spans: array<Span>;
 @group(0) @binding(7) var<storage, read> codes: array<f32>;
@@ -105,23 +105,22 @@ fn layer_of(ix: u32) -> Layer {
 fn work_out(layer: Layer, tile: u32, lane: u32) {
     let part = lane % PARTS;
     let n_words = layer.n_in / 4u;
-    let apart = layer.n_out / 4u;      // of a thread's rows, so that those of neighboring threads follow each other
-    for (var group = lane / PARTS; group < apart; group += LANES / PARTS) {
+    for (var group = lane / PARTS; group < layer.n_out / 4u; group += LANES / PARTS) {
+        let row = layer.first_weight + 4u * group * n_words;
         var sums: mat4x4f; // a column a row
         for (var k = 0u; k < n_words; k++) {
             let at = layer.from_bank + 4u * k * STRIDE + part;
             let x = mat4x4f(wg_rows[at], wg_rows[at + STRIDE], wg_rows[at + 2u * STRIDE], wg_rows[at + 3u * STRIDE]);
-            let w_at = layer.first_weight + k * layer.n_out + group;
-            let w = mat4x4f(arranged[w_at], arranged[w_at + apart], arranged[w_at + 2u * apart], arranged[w_at + 3u * apart]);
+            let w = mat4x4f(weights[row + k], weights[row + n_words + k], weights[row + 2u * n_words + k], weights[row + 3u * n_words + k]);
             sums += x * w;
         }
         for (var j = 0u; j < 4u; j++) {
             var sum = sums[j];
             if layer.kept_row != NOT_KEPT {
                 sum = max(sum, vec4f(0.0));
-                if KEEPS { keep(tile, layer.kept_row + group + j * apart, part, sum); }
+                if KEEPS { keep(tile, layer.kept_row + 4u * group + j, part, sum); }
             }
-            wg_rows[(BANK - layer.from_bank) + (group + j * apart) * STRIDE + part] = sum;
+            wg_rows[(BANK - layer.from_bank) + (4u * group + j) * STRIDE + part] = sum;
         }
     }
     workgroupBarrier(); // The rows are there before the next layer reads them, and this one has read what that overwrites.

@@ -52,7 +52,6 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("picture_rays"),
     kernel!("show_rays"),
     kernel!("find_samples"),
-    kernel!("arrange_weights"),
     kernel!("field_forward"),
     kernel!("composite"),
     kernel!("field_backward"),
@@ -136,9 +135,6 @@ pub(crate) struct FieldPipelines {
     pub(crate) field_backward: Pipeline,
     pub(crate) weight_slopes: Pipeline,
     pub(crate) learn_weights: Pipeline,
-    pub(crate) arrange_weights: Pipeline,
-    /// Words that a workgroup of it arranges.
-    pub(crate) n_arranged: u32,
     pub(crate) learn_grid: Pipeline,
     pub(crate) end_step: Pipeline,
 }
@@ -192,8 +188,6 @@ impl FieldPipelines {
             field_backward: field_backward?,
             weight_slopes: weight_slopes?,
             learn_weights: Pipeline::new(gpu, kernel!("learn_weights"), &[("CHUNK", f64::from(N_CHUNK))])?,
-            arrange_weights: Pipeline::new(gpu, kernel!("arrange_weights"), &sizes)?,
-            n_arranged: 2 * n_hidden,
             learn_grid: plain(kernel!("learn_grid"))?,
             end_step: plain(kernel!("end_step"))?,
         })

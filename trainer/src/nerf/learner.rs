@@ -88,7 +88,7 @@ impl Learner {
         let n_points = (f64::from(n_cells.pow(3)) * VISITED_FRAC) as u32;
         let visit =
             Visit { n_cells, n_points: n_points.min(n_samples), kept_frac: KEPT_FRAC, step: 2.0 / n_steps as f32 };
-        let mut learner = Self {
+        let learner = Self {
             pipelines,
             moments: FieldMoments::new(gpu, &shape, &widths, &rule(options, 0.0))?,
             occupancy: Occupancy::new(gpu, &visit, sizes.has_depth)?,
@@ -106,7 +106,6 @@ impl Learner {
             sizes,
         };
         learner.fill(gpu, options.seed, &widths);
-        learner.arrange(gpu)?;
         Ok(learner)
     }
 
@@ -125,15 +124,6 @@ impl Learner {
             weights.extend((0..(n_in * n_out) as usize).map(|at| uniform(stream, at, most)));
         }
         gpu.write(&self.field.weights, 0, bytemuck::cast_slice(&weights));
-    }
-
-    /// After the weights were given: makes the field fit to be looked at.
-    pub(crate) fn arrange(&mut self, gpu: &Gpu) -> Result<(), Error> {
-        self.make_slot(gpu, 0)?;
-        let Self { pipelines, field, samples, slots, passes: list, .. } = self;
-        FieldPasses { gpu, pipelines, field, samples, slot: &slots[0] }.arrange(list);
-        list.submit(gpu);
-        Ok(())
     }
 
     /// Bytes of what is learned, its slopes and moments.

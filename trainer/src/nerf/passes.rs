@@ -143,7 +143,7 @@ impl FieldPasses<'_> {
             ("levels", &field.levels),
             ("points", &samples.points),
             ("grid", &field.grid),
-            ("arranged", &field.arranged),
+            ("weights", &field.weights),
             ("rays", &slot.rays),
             ("spans", &samples.spans),
             ("codes", &field.codes),
@@ -152,14 +152,6 @@ impl FieldPasses<'_> {
             ("held", held),
         ];
         list.dispatch(gpu, pipeline, groups(samples.n_samples, N_TILE), &buffers);
-    }
-
-    /// After weights have changed: arranges them for the way there.
-    pub(crate) fn arrange(&self, list: &mut Passes) {
-        let Self { gpu, pipelines, field, .. } = *self;
-        let n_groups = (field.weights.bytes() / 16).div_ceil(pipelines.n_arranged.into());
-        let buffers = [("weights", &field.weights), ("arranged", &field.arranged)];
-        list.dispatch(gpu, &pipelines.arrange_weights, n_groups, &buffers);
     }
 
     /// Finds the next samples of a picture's rays.
@@ -268,7 +260,6 @@ impl FieldPasses<'_> {
             ("moments", &moments.weights),
         ];
         list.dispatch(gpu, &pipelines.learn_weights, (field.weights.bytes() / 16).div_ceil(16), &weighed);
-        self.arrange(list);
         let (scales, largest) = (("scales", &slopes.scales), ("largest", &moments.largest));
         let learned = [
             ("rule", of_grid),

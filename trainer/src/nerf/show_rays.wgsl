@@ -31,8 +31,8 @@ struct Backdrop {
 @group(0) @binding(10) var<storage, read_write> light: array<vec4f>;
 
 const LEAST_COVERAGE = 1e-3;
-// Behind what lets less light through nothing is looked at.
-const LEAST_TRANSMITTANCE = 1e-3;
+// Behind what lets less light through nothing is looked at: it is half of the least difference of a color.
+const LEAST_TRANSMITTANCE = 1.0 / 512.0;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {

@@ -116,11 +116,10 @@ impl NerfModel {
         if let Some((extent, sizes)) = &state.field {
             sizes.check()?;
             let compiled = Compiled::new(&model.gpu, &sizes.effort)?;
-            let mut learner = Learner::new(&model.gpu, &model.options, sizes.clone(), compiled)?;
+            let learner = Learner::new(&model.gpu, &model.options, sizes.clone(), compiled)?;
             for (name, buffer) in buffers(&learner) {
                 model.gpu.write(buffer, 0, checkpoint.array(&name, buffer.bytes())?);
             }
-            learner.arrange(&model.gpu)?;
             model.field = Some((*extent, learner));
         }
         model.step = state.step;
