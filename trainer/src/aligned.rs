@@ -20,6 +20,9 @@ const ABOUT_KEY: &str = "alignment";
 /// A model that has seen nothing.
 pub type Make = Box<dyn Fn() -> Result<Box<dyn Method>, Error>>;
 
+/// A model that goes on from a checkpoint, and the keyframes that it had not learned from.
+pub type WithRest = (Box<dyn Method>, Vec<Arc<Keyframe>>);
+
 /// A model, and what is known about the cameras of its keyframes.
 pub struct Aligned {
     make: Option<Make>,
@@ -84,8 +87,8 @@ impl Aligned {
         checkpoint: &Checkpoint,
         keyframes: &[Arc<Keyframe>],
         make: Make,
-        resume: impl FnOnce(&Checkpoint, &[Arc<Keyframe>]) -> Result<(Box<dyn Method>, Vec<Arc<Keyframe>>), Error>,
-    ) -> Result<(Box<dyn Method>, Vec<Arc<Keyframe>>), Error> {
+        resume: impl FnOnce(&Checkpoint, &[Arc<Keyframe>]) -> Result<WithRest, Error>,
+    ) -> Result<WithRest, Error> {
         let mut own = checkpoint.clone();
         let Some(state) = own.state.as_object_mut().and_then(|state| state.remove(STATE_KEY)) else {
             return resume(checkpoint, keyframes);
@@ -254,12 +257,7 @@ mod tests {
         ]
     }
 
-    fn resumed(
-        gpu: &Arc<Gpu>,
-        checkpoint: &Checkpoint,
-        keyframes: &[Arc<Keyframe>],
-        make: Make,
-    ) -> (Box<dyn Method>, Vec<Arc<Keyframe>>) {
+    fn resumed(gpu: &Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>], make: Make) -> WithRest {
         Aligned::resume(checkpoint, keyframes, make, |own, keyframes| {
             if own.method == "tsdf" {
                 let (model, rest) = TsdfModel::resume(gpu.clone(), own, keyframes)?;
