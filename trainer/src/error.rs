@@ -43,6 +43,16 @@ pub enum Error {
         /// Bytes allowed.
         limit_bytes: u64,
     },
+    /// A kernel needs more memory of a workgroup than the adapter has.
+    #[error("kernel {kernel}: {bytes} bytes of workgroup memory are more than this GPU has ({limit_bytes} bytes)")]
+    WorkgroupTooLarge {
+        /// Name of the kernel.
+        kernel: &'static str,
+        /// Bytes wanted.
+        bytes: u32,
+        /// Bytes there are.
+        limit_bytes: u32,
+    },
     /// Less memory than the smallest model of the method takes.
     #[error("max_bytes = {max_bytes}: the smallest neural field takes {least_bytes} bytes")]
     BudgetTooSmall {

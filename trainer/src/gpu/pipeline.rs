@@ -29,6 +29,10 @@ impl Pipeline {
         let name = kernel.source.name;
         let text = resolve(kernel.source, kernel.shared)?;
         let module = reflect(name, &text)?;
+        let (bytes, limit_bytes) = (wgsl::workgroup_bytes(&module), gpu.max_workgroup_bytes());
+        if bytes > limit_bytes {
+            return Err(Error::WorkgroupTooLarge { kernel: name, bytes, limit_bytes });
+        }
         let bindings = wgsl::bindings(&module);
         let device = &gpu.device;
         let described =
@@ -73,5 +77,22 @@ impl Pipeline {
             cache: None,
         });
         Ok(Self { id: gpu.fresh_id(), name, raw, layout, bindings })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::GpuOptions;
+
+    #[test]
+    fn a_kernel_that_shares_too_much_memory_is_refused() {
+        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let text = "var<workgroup> wg_all: array<vec4f, 100000>;
+            @compute @workgroup_size(64)
+            fn main(@builtin(local_invocation_index) lane: u32) { wg_all[lane] = vec4f(0.0); }";
+        let kernel = Kernel { source: Source { name: "large", text }, shared: &[] };
+        let refused = Pipeline::new(&gpu, kernel, &[]).unwrap_err();
+        assert!(matches!(refused, Error::WorkgroupTooLarge { kernel: "large", bytes: 1_600_000, .. }), "{refused}");
     }
 }

@@ -65,6 +65,12 @@ pub fn reflect(name: &'static str, text: &str) -> Result<naga::Module, Error> {
     Ok(module)
 }
 
+/// Memory that a workgroup shares, bytes.
+pub(super) fn workgroup_bytes(module: &naga::Module) -> u32 {
+    let shared = module.global_variables.iter().filter(|(_, variable)| variable.space == naga::AddressSpace::WorkGroup);
+    shared.map(|(_, variable)| module.types[variable.ty].inner.size(module.to_ctx())).sum()
+}
+
 /// The buffers of group 0 in order of their numbers.
 pub(super) fn bindings(module: &naga::Module) -> Vec<Binding> {
     let mut found: Vec<Binding> = module
