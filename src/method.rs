@@ -11,7 +11,7 @@ use trainer::gpu::Gpu;
 use trainer::nerf::{NerfModel, NerfOptions};
 use trainer::splat::{CameraChoice, SplatOptions, SplatTrainer};
 use trainer::tsdf::{TsdfModel, TsdfOptions};
-use trainer::{Aligned, Keyframe, Make, Method};
+use trainer::{Aligned, Keyframe, Method, Renewable};
 
 /// The scene models there are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -49,28 +49,20 @@ impl Kind {
     /// A model that has seen nothing yet. Of the options a distance field has the memory it may take, a neural field also
     /// seed and planned steps, and both alignment; what else they want to know they find in the keyframes.
     pub(crate) fn start(self, gpu: Arc<Gpu>, options: SplatOptions) -> anyhow::Result<Box<dyn Method>> {
-        if self == Self::Splat {
-            return Ok(Box::new(SplatTrainer::new(gpu, options)?));
-        }
-        let make = self.make(&gpu, &options);
-        if options.align == CameraChoice::default() {
-            return Ok(make()?);
-        }
-        Ok(Box::new(Aligned::new(make, options.align, gpu.is_software(), options.n_planned_steps)?))
-    }
-
-    /// Makes models of this kind.
-    fn make(self, gpu: &Arc<Gpu>, options: &SplatOptions) -> Make {
-        let (gpu, options) = (gpu.clone(), options.clone());
-        Box::new(move || {
-            let gpu = gpu.clone();
-            Ok(match self {
-                Self::Splat => Box::new(SplatTrainer::new(gpu, options.clone())?),
-                Self::Tsdf => Box::new(TsdfModel::new(gpu, tsdf_options(&options))?),
-                Self::Nerf => Box::new(NerfModel::new(gpu, nerf_options(&options))?),
-            })
+        Ok(match self {
+            Self::Splat => Box::new(SplatTrainer::new(gpu, options)?),
+            Self::Tsdf => aligned(TsdfModel::new(gpu.clone(), tsdf_options(&options))?, &gpu, options),
+            Self::Nerf => aligned(NerfModel::new(gpu.clone(), nerf_options(&options))?, &gpu, options),
         })
     }
+}
+
+/// The model, with its cameras aligned where that is asked for.
+fn aligned(model: impl Renewable + 'static, gpu: &Gpu, options: SplatOptions) -> Box<dyn Method> {
+    if options.align == CameraChoice::default() {
+        return Box::new(model);
+    }
+    Box::new(Aligned::new(model, options.align, gpu.is_software(), options.n_planned_steps))
 }
 
 fn tsdf_options(options: &SplatOptions) -> TsdfOptions {
@@ -94,26 +86,18 @@ pub(crate) struct Resumed {
 
 /// Goes on from a checkpoint; what was learned from must be among the keyframes.
 pub(crate) fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<Resumed> {
-    let usual = SplatOptions::default;
-    // What a model was made with is in its checkpoint; a new one is made the same way.
     if checkpoint.method == Kind::Tsdf.name() {
         let TsdfOptions { max_bytes, .. } = made_with(checkpoint)?;
-        let options = SplatOptions { max_bytes, ..usual() };
-        let (method, rest) =
-            Aligned::resume(checkpoint, keyframes, Kind::Tsdf.make(&gpu, &options), |own, keyframes| {
-                let (model, rest) = TsdfModel::resume(gpu.clone(), own, keyframes)?;
-                Ok((Box::new(model), rest))
-            })?;
+        let options = SplatOptions { max_bytes, ..SplatOptions::default() };
+        let resume = |own: &Checkpoint, keyframes: &[_]| TsdfModel::resume(gpu, own, keyframes);
+        let (method, rest) = Aligned::resume(checkpoint, keyframes, resume)?;
         return Ok(Resumed { kind: Kind::Tsdf, method, options, rest });
     }
     if checkpoint.method == Kind::Nerf.name() {
         let NerfOptions { seed, max_bytes, n_planned_steps, .. } = made_with(checkpoint)?;
-        let options = SplatOptions { seed, max_bytes, n_planned_steps, ..usual() };
-        let (method, rest) =
-            Aligned::resume(checkpoint, keyframes, Kind::Nerf.make(&gpu, &options), |own, keyframes| {
-                let (model, rest) = NerfModel::resume(gpu.clone(), own, keyframes)?;
-                Ok((Box::new(model), rest))
-            })?;
+        let options = SplatOptions { seed, max_bytes, n_planned_steps, ..SplatOptions::default() };
+        let resume = |own: &Checkpoint, keyframes: &[_]| NerfModel::resume(gpu, own, keyframes);
+        let (method, rest) = Aligned::resume(checkpoint, keyframes, resume)?;
         return Ok(Resumed { kind: Kind::Nerf, method, options, rest });
     }
     let (model, rest) = SplatTrainer::resume(gpu, checkpoint, keyframes)?;
@@ -144,8 +128,8 @@ pub(crate) fn kind_in(folder: &Path) -> anyhow::Result<Option<Kind>> {
 /// A saved model: its folder, of any kind, or a file of splats.
 pub(crate) fn load(gpu: Arc<Gpu>, model: &Path) -> anyhow::Result<Box<dyn Method>> {
     match kind_in(model)? {
-        Some(Kind::Tsdf) => return Ok(Aligned::of_folder(Box::new(TsdfModel::load(gpu, model)?), model)?),
-        Some(Kind::Nerf) => return Ok(Aligned::of_folder(Box::new(NerfModel::load(gpu, model)?), model)?),
+        Some(Kind::Tsdf) => return Ok(Box::new(Aligned::of_folder(TsdfModel::load(gpu, model)?, model)?)),
+        Some(Kind::Nerf) => return Ok(Box::new(Aligned::of_folder(NerfModel::load(gpu, model)?, model)?)),
         Some(Kind::Splat) | None => {}
     }
     let splats = splat_file::read(model)?;

@@ -1,12 +1,11 @@
 //! A scene model whose cameras are aligned before they are believed.
 //!
-//! Any model can be made anew from keyframes: alignment runs beside it, and where that keeps something, the model begins again with
-//! corrected ones. Splats, which try out more about cameras, have alignment of their own.
+//! Alignment runs beside learning, and where that keeps something, the model begins anew with corrected keyframes. Splats, which try out more about cameras, have alignment of their own.
 
 use crate::align::{Aligning, Alignment, taken_at};
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::gpu::PassTiming;
-use crate::splat::{CameraChoice, PosedLens};
+use crate::splat::{CameraChoice, PosedLens, read_about};
 use crate::{Error, Keyframe, Method, Part, Picture, Progress, RenderRequest};
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
@@ -17,16 +16,19 @@ use std::sync::Arc;
 const STATE_KEY: &str = "aligned";
 const ABOUT_KEY: &str = "alignment";
 
-/// A model that has seen nothing.
-pub type Make = Box<dyn Fn() -> Result<Box<dyn Method>, Error>>;
+/// A model that can begin anew.
+pub trait Renewable: Method {
+    /// Forgets all keyframes and all that was learned; what is compiled may stay.
+    fn begin_anew(&mut self) -> Result<(), Error>;
+}
 
 /// A model that goes on from a checkpoint, and the keyframes that it had not learned from.
 pub type WithRest = (Box<dyn Method>, Vec<Arc<Keyframe>>);
 
 /// A model, and what is known about the cameras of its keyframes.
-pub struct Aligned {
-    make: Option<Make>,
-    model: Box<dyn Method>,
+#[derive(Debug)]
+pub struct Aligned<M> {
+    model: M,
     choice: CameraChoice,
     aligning: Aligning,
     /// As they came, until alignment is settled.
@@ -47,38 +49,17 @@ struct State {
     n_before: u64,
 }
 
-impl std::fmt::Debug for Aligned {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Aligned")
-            .field("choice", &self.choice)
-            .field("aligning", &self.aligning)
-            .finish_non_exhaustive()
-    }
-}
-
-impl Aligned {
+impl<M: Renewable + 'static> Aligned<M> {
     /// A model whose keyframes are aligned as `choice` says; the result is taken early in `n_planned_steps`.
-    pub fn new(make: Make, choice: CameraChoice, is_software: bool, n_planned_steps: u64) -> Result<Self, Error> {
-        Ok(Self {
-            model: make()?,
-            make: Some(make),
-            aligning: Aligning::new(&choice),
-            choice,
-            given: Vec::new(),
-            taken_at: taken_at(is_software, n_planned_steps),
-            n_before: 0,
-        })
+    pub fn new(model: M, choice: CameraChoice, is_software: bool, n_planned_steps: u64) -> Self {
+        let (aligning, taken_at) = (Aligning::new(&choice), taken_at(is_software, n_planned_steps));
+        Self { model, choice, aligning, given: Vec::new(), taken_at, n_before: 0 }
     }
 
     /// A saved model, with what its folder knows about cameras.
-    pub fn of_folder(model: Box<dyn Method>, folder: &Path) -> Result<Box<dyn Method>, Error> {
-        let path = folder.join("model.json");
-        let Some(alignment) = about(&path)?.remove(ABOUT_KEY) else { return Ok(model) };
-        let refused = |error: serde_json::Error| Error::SplatFile { path, reason: error.to_string() };
-        let aligning = Aligning::Done(Some(serde_json::from_value(alignment).map_err(refused)?));
-        let choice = CameraChoice::default();
-        let (make, given) = (None, Vec::new());
-        Ok(Box::new(Self { make, model, choice, aligning, given, taken_at: 0, n_before: 0 }))
+    pub fn of_folder(model: M, folder: &Path) -> Result<Self, Error> {
+        let aligning = Aligning::Done(read_about(&folder.join("model.json"))?.alignment);
+        Ok(Self { model, choice: CameraChoice::default(), aligning, given: Vec::new(), taken_at: 0, n_before: 0 })
     }
 
     /// Goes on from a checkpoint with `resume`, which finds the keyframes among those it is given, each as it was learned
@@ -86,12 +67,12 @@ impl Aligned {
     pub fn resume(
         checkpoint: &Checkpoint,
         keyframes: &[Arc<Keyframe>],
-        make: Make,
-        resume: impl FnOnce(&Checkpoint, &[Arc<Keyframe>]) -> Result<WithRest, Error>,
+        resume: impl FnOnce(&Checkpoint, &[Arc<Keyframe>]) -> Result<(M, Vec<Arc<Keyframe>>), Error>,
     ) -> Result<WithRest, Error> {
         let mut own = checkpoint.clone();
         let Some(state) = own.state.as_object_mut().and_then(|state| state.remove(STATE_KEY)) else {
-            return resume(checkpoint, keyframes);
+            let (model, rest) = resume(checkpoint, keyframes)?;
+            return Ok((Box::new(model), rest));
         };
         let bad = |error: serde_json::Error| Error::CheckpointState { reason: error.to_string() };
         let State { choice, is_settled, alignment, taken_at, n_before } = serde_json::from_value(state).map_err(bad)?;
@@ -104,30 +85,24 @@ impl Aligned {
         };
         let (as_given, learned): (Vec<_>, Vec<_>) = keyframes.iter().cloned().partition(is_rest);
         let given = if is_settled { Vec::new() } else { learned };
-        Ok((Box::new(Self { make: Some(make), model, choice, aligning, given, taken_at, n_before }), as_given))
+        Ok((Box::new(Self { model, choice, aligning, given, taken_at, n_before }), as_given))
     }
 
     /// Takes what alignment found, and begins anew where that is anything.
     fn settle(&mut self) -> Result<(), Error> {
         let is_any = self.aligning.finish()?;
         let given = std::mem::take(&mut self.given);
-        let Some(make) = self.make.as_ref().filter(|_| is_any) else { return Ok(()) };
+        if !is_any {
+            return Ok(());
+        }
         log::info!("training begins anew with corrected cameras");
         self.n_before += self.model.n_taken()?;
-        self.model = make()?;
-        self.model.prepare()?;
+        self.model.begin_anew()?;
         given.iter().try_for_each(|keyframe| self.model.push(self.aligning.corrected(keyframe)))
     }
 }
 
-/// What a folder says about its model.
-fn about(path: &Path) -> Result<serde_json::Map<String, serde_json::Value>, Error> {
-    let refused = |reason: String| Error::SplatFile { path: path.to_owned(), reason };
-    let bytes = std::fs::read(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
-    serde_json::from_slice(&bytes).map_err(|error| refused(error.to_string()))
-}
-
-impl Method for Aligned {
+impl<M: Renewable + 'static> Method for Aligned<M> {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         let corrected = self.aligning.corrected(&keyframe);
         if !self.aligning.is_done() {
@@ -205,8 +180,9 @@ impl Method for Aligned {
         self.model.save(folder)?;
         let Some(alignment) = self.aligning.result() else { return Ok(()) };
         let path = folder.join("model.json");
-        let mut about = about(&path)?;
         let refused = |error: serde_json::Error| Error::SplatFile { path: path.clone(), reason: error.to_string() };
+        let bytes = std::fs::read(&path).map_err(|source| Error::Read { path: path.clone(), source })?;
+        let mut about: serde_json::Map<String, serde_json::Value> = serde_json::from_slice(&bytes).map_err(refused)?;
         about.insert(ABOUT_KEY.to_owned(), serde_json::to_value(alignment).map_err(refused)?);
         let text = format!("{:#}\n", serde_json::Value::Object(about));
         std::fs::write(&path, text).map_err(|source| Error::Write { path: path.clone(), source })
@@ -247,27 +223,17 @@ mod tests {
     const TAKEN_AT: u64 = 6;
     const MOUNT: TermSet = TermSet { mount: true, ..TermSet::NONE };
 
-    fn makes(gpu: &Arc<Gpu>) -> [Make; 2] {
-        let (of_tsdf, of_nerf) = (gpu.clone(), gpu.clone());
-        let effort = Effort { n_rays: 64, n_samples: 1 << 10, n_cells: 32, most_log2_entries: 10, ..Effort::SMALL };
-        let options = NerfOptions { effort: Some(effort), n_planned_steps: 4 * TAKEN_AT, ..NerfOptions::default() };
-        [
-            Box::new(move || Ok(Box::new(TsdfModel::new(of_tsdf.clone(), TsdfOptions::default())?))),
-            Box::new(move || Ok(Box::new(NerfModel::new(of_nerf.clone(), options.clone())?))),
-        ]
+    fn tsdf(gpu: &Arc<Gpu>) -> TsdfModel {
+        TsdfModel::new(gpu.clone(), TsdfOptions::default()).unwrap()
     }
 
-    fn resumed(gpu: &Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>], make: Make) -> WithRest {
-        Aligned::resume(checkpoint, keyframes, make, |own, keyframes| {
-            if own.method == "tsdf" {
-                let (model, rest) = TsdfModel::resume(gpu.clone(), own, keyframes)?;
-                return Ok((Box::new(model), rest));
-            }
-            let (model, rest) = NerfModel::resume(gpu.clone(), own, keyframes)?;
-            Ok((Box::new(model), rest))
-        })
-        .unwrap()
+    fn nerf(gpu: &Arc<Gpu>) -> NerfModel {
+        let effort = Effort { n_rays: 64, n_samples: 1 << 10, n_cells: 32, most_log2_entries: 10, ..Effort::SMALL };
+        let options = NerfOptions { effort: Some(effort), n_planned_steps: 4 * TAKEN_AT, ..NerfOptions::default() };
+        NerfModel::new(gpu.clone(), options).unwrap()
     }
+
+    type Resume<M> = fn(Arc<Gpu>, &Checkpoint, &[Arc<Keyframe>]) -> Result<(M, Vec<Arc<Keyframe>>), Error>;
 
     fn learn(model: &mut dyn Method, n_steps: u64) {
         for _ in 0..n_steps {
@@ -278,64 +244,73 @@ mod tests {
     #[test]
     fn models_begin_anew_with_corrected_cameras_and_stopping_in_between_changes_nothing() {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        begins_anew(&gpu, tsdf(&gpu), TsdfModel::resume, TsdfModel::load);
+        begins_anew(&gpu, nerf(&gpu), NerfModel::resume, NerfModel::load);
+    }
+
+    fn begins_anew<M: Renewable + 'static>(
+        gpu: &Arc<Gpu>,
+        model: M,
+        resume: Resume<M>,
+        load: fn(Arc<Gpu>, &Path) -> Result<M, Error>,
+    ) {
         let wrong = Wrong { mount: wrong_mount(), ..Wrong::nothing() };
         let keyframes = capture(&wrong);
         let test = keyframes.iter().find(|keyframe| keyframe.split == Split::Test).unwrap();
-        for (make, again) in makes(&gpu).into_iter().zip(makes(&gpu)) {
-            let mut whole = Aligned::new(make, CameraChoice::Given(MOUNT), true, 4 * TAKEN_AT).unwrap();
-            keyframes.iter().for_each(|keyframe| whole.push(keyframe.clone()).unwrap());
-            learn(&mut whole, TAKEN_AT - 2);
-            let early = whole.checkpoint().unwrap().finish().unwrap();
-            learn(&mut whole, 2);
-            assert!(whole.alignment().is_none() && whole.progress().step == TAKEN_AT);
-            learn(&mut whole, 1);
-            assert_eq!((whole.progress().step, whole.n_taken().unwrap()), (1, TAKEN_AT + 1), "it began anew");
-            let fix = whole.alignment().unwrap().fixes["wrist"].clone();
-            let (degrees, mm) = left(&fix, &wrong.mount);
-            assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
-            assert_eq!(whole.posed_lens(test).unwrap(), fix.apply(test));
-            learn(&mut whole, 2);
+        let mut whole = Aligned::new(model, CameraChoice::Given(MOUNT), true, 4 * TAKEN_AT);
+        keyframes.iter().for_each(|keyframe| whole.push(keyframe.clone()).unwrap());
+        learn(&mut whole, TAKEN_AT - 2);
+        let early = whole.checkpoint().unwrap().finish().unwrap();
+        learn(&mut whole, 2);
+        assert!(whole.alignment().is_none() && whole.progress().step == TAKEN_AT);
+        learn(&mut whole, 1);
+        assert_eq!((whole.progress().step, whole.n_taken().unwrap()), (1, TAKEN_AT + 1), "it began anew");
+        let fix = whole.alignment().unwrap().fixes["wrist"].clone();
+        let (degrees, mm) = left(&fix, &wrong.mount);
+        assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
+        assert_eq!(whole.posed_lens(test).unwrap(), fix.apply(test));
+        learn(&mut whole, 2);
 
-            let (mut parts, rest) = resumed(&gpu, &early, &keyframes, again);
-            let is_given = |keyframe: &Arc<Keyframe>| keyframes.iter().any(|given| Arc::ptr_eq(given, keyframe));
-            assert!(!rest.is_empty() && rest.iter().all(is_given));
-            rest.into_iter().for_each(|keyframe| parts.push(keyframe).unwrap());
-            learn(&mut *parts, 3);
-            let late = parts.checkpoint().unwrap().finish().unwrap();
-            let make = makes(&gpu).into_iter().nth(usize::from(late.method == "nerf")).unwrap();
-            let (mut parts, rest) = resumed(&gpu, &late, &keyframes, make);
-            rest.into_iter().for_each(|keyframe| parts.push(keyframe).unwrap());
-            learn(&mut *parts, 2);
-            let [whole_end, parts_end] =
-                [&mut whole as &mut dyn Method, &mut *parts].map(|model| model.checkpoint().unwrap().finish().unwrap());
-            assert_eq!(whole_end, parts_end);
+        let resumed = |checkpoint: &Checkpoint| {
+            Aligned::resume(checkpoint, &keyframes, |own, keyframes| resume(gpu.clone(), own, keyframes)).unwrap()
+        };
+        let (mut parts, rest) = resumed(&early);
+        let is_given = |keyframe: &Arc<Keyframe>| keyframes.iter().any(|given| Arc::ptr_eq(given, keyframe));
+        assert!(!rest.is_empty() && rest.iter().all(is_given));
+        rest.into_iter().for_each(|keyframe| parts.push(keyframe).unwrap());
+        learn(&mut *parts, 3);
+        let (mut parts, rest) = resumed(&parts.checkpoint().unwrap().finish().unwrap());
+        rest.into_iter().for_each(|keyframe| parts.push(keyframe).unwrap());
+        learn(&mut *parts, 2);
+        let [whole_end, parts_end] =
+            [&mut whole as &mut dyn Method, &mut *parts].map(|model| model.checkpoint().unwrap().finish().unwrap());
+        assert_eq!(whole_end, parts_end);
 
-            let folder = tempfile::tempdir().unwrap();
-            whole.save(folder.path()).unwrap();
-            let plain: Box<dyn Method> = if late.method == "tsdf" {
-                Box::new(TsdfModel::load(gpu.clone(), folder.path()).unwrap())
-            } else {
-                Box::new(NerfModel::load(gpu.clone(), folder.path()).unwrap())
-            };
-            let mut loaded = Aligned::of_folder(plain, folder.path()).unwrap();
-            assert_eq!(loaded.posed_lens(test).unwrap(), fix.apply(test));
-        }
+        let folder = tempfile::tempdir().unwrap();
+        whole.save(folder.path()).unwrap();
+        let loaded = || Aligned::of_folder(load(gpu.clone(), folder.path()).unwrap(), folder.path()).unwrap();
+        assert_eq!(loaded().posed_lens(test).unwrap(), fix.apply(test));
+        std::fs::remove_file(folder.path().join("model.json")).unwrap();
+        assert_eq!(loaded().posed_lens(test).unwrap(), PosedLens::of(test), "nothing is known without the file");
     }
 
     #[test]
     fn nothing_to_learn_from_is_idle_and_what_cannot_be_aligned_goes_on() {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
-        for make in makes(&gpu) {
-            let mut model = Aligned::new(make, CameraChoice::Given(MOUNT), true, 4 * TAKEN_AT).unwrap();
-            assert!(model.is_idle());
-            for keyframe in scenes::ring(&[scenes::floor()], nalgebra::Point3::origin(), 2) {
-                model.push(keyframe).unwrap();
-            }
-            while !model.is_idle() && model.progress().step < TAKEN_AT + 2 {
-                model.step(1).unwrap();
-            }
-            assert!(model.alignment().is_none_or(|alignment| !alignment.is_any()));
-            assert!(model.progress().step > 0);
+        goes_on(tsdf(&gpu));
+        goes_on(nerf(&gpu));
+    }
+
+    fn goes_on<M: Renewable + 'static>(model: M) {
+        let mut model = Aligned::new(model, CameraChoice::Given(MOUNT), true, 4 * TAKEN_AT);
+        assert!(model.is_idle());
+        for keyframe in scenes::ring(&[scenes::floor()], nalgebra::Point3::origin(), 2) {
+            model.push(keyframe).unwrap();
         }
+        while !model.is_idle() && model.progress().step < TAKEN_AT + 2 {
+            model.step(1).unwrap();
+        }
+        assert!(model.alignment().is_none_or(|alignment| !alignment.is_any()));
+        assert!(model.progress().step > 0);
     }
 }

@@ -27,7 +27,7 @@ mod test_scenes;
 
 pub mod tsdf;
 
-pub use aligned::{Aligned, Make, WithRest};
+pub use aligned::{Aligned, Renewable, WithRest};
 pub use error::Error;
 pub use keyframe::{DepthMap, Keyframe, Split, Truth};
 pub use method::{Method, Part, Progress};

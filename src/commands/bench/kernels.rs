@@ -141,11 +141,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
                 step_wall_ms: figures.step_wall_millis,
                 mean_rgb: figures.mean_rgb,
                 peak_mb: figures.peak_bytes >> 20,
-                passes: if args.profile {
-                    figures.passes.iter().map(|pass| (pass.name, pass.millis)).collect()
-                } else {
-                    Vec::new()
-                },
+                passes: super::profile(&figures.passes, args.profile),
             };
             if args.json {
                 writeln!(out, "{}", serde_json::to_string(&row)?)?;

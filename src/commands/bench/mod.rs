@@ -9,6 +9,7 @@ mod stability;
 
 use crate::exit::Exit;
 use clap::{Parser, Subcommand};
+use trainer::gpu::PassTiming;
 
 /// What to measure.
 #[derive(Debug, Parser)]
@@ -31,6 +32,11 @@ enum What {
     Ablation(ablation::Args),
     /// PSNR of held-out images over the size of a disturbance of the training images, and where it breaks
     Stability(stability::Args),
+}
+
+/// Names and milliseconds of passes, where they are asked for.
+fn profile(passes: &[PassTiming], is_asked: bool) -> Vec<(&'static str, f64)> {
+    if is_asked { passes.iter().map(|pass| (pass.name, pass.millis)).collect() } else { Vec::new() }
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {

@@ -12,6 +12,7 @@ use super::sizes::Sizes;
 use crate::Error;
 use crate::gpu::{Gpu, PassTiming, f32_of, f32s_of};
 use nalgebra::Vector3;
+use std::sync::Arc;
 use std::time::Instant;
 
 /// Levels, coarsest and finest cells along an axis, and the logarithm of the entries of a level: as Mueller et al. 2022 have it.
@@ -45,7 +46,7 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
     let (n_levels, coarsest, finest, log2_entries) = GRID;
     let shape = GridShape::between(coarsest, finest, n_levels, log2_entries);
     let sizes = Sizes { n_cells: shape.n_cells, log2_entries, n_codes: 1, has_depth: false, effort };
-    let compiled = Compiled::new(gpu, &sizes.effort)?;
+    let compiled = Arc::new(Compiled::new(gpu, &sizes.effort)?);
     let mut learner = Learner::new(gpu, &options, sizes, compiled)?;
     let rays = synthetic_rays(effort);
     let submit = |learner: &mut Learner, n_steps: usize| {

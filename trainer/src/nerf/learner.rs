@@ -12,6 +12,7 @@ use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
 use crate::splat::Camera;
 use crate::{Error, Picture};
 use rayon::prelude::*;
+use std::sync::Arc;
 
 /// Most steps of a submit: their rays lie on the GPU at once.
 pub(crate) const STEPS_PER_SUBMIT: usize = 8;
@@ -52,7 +53,7 @@ pub(crate) struct Learner {
     pub(crate) moments: FieldMoments,
     pub(crate) slopes: FieldSlopes,
     pub(crate) occupancy: Occupancy,
-    pipelines: FieldPipelines,
+    compiled: Arc<Compiled>,
     samples: SampleBuffers,
     step: StepBuffers,
     slots: Vec<RaySlot>,
@@ -77,10 +78,10 @@ impl Compiled {
 
 impl Learner {
     /// A field that knows nothing.
-    pub(crate) fn new(gpu: &Gpu, options: &NerfOptions, sizes: Sizes, compiled: Compiled) -> Result<Self, Error> {
+    pub(crate) fn new(gpu: &Gpu, options: &NerfOptions, sizes: Sizes, compiled: Arc<Compiled>) -> Result<Self, Error> {
         let Effort { n_rays, n_samples, n_cells, n_steps, .. } = sizes.effort;
         let shape = sizes.shape();
-        let Compiled { pipelines, widths } = compiled;
+        let widths = compiled.widths.clone();
         let field = FieldBuffers::new(gpu, &shape, &widths, sizes.n_codes)?;
         let slopes = FieldSlopes::new(gpu, &shape)?;
         gpu.write(&slopes.scales, 0, bytemuck::cast_slice(&vec![FIRST_SCALE; shape.n_cells.len()]));
@@ -89,7 +90,7 @@ impl Learner {
         let visit =
             Visit { n_cells, n_points: n_points.min(n_samples), kept_frac: KEPT_FRAC, step: 2.0 / n_steps as f32 };
         let learner = Self {
-            pipelines,
+            compiled,
             moments: FieldMoments::new(gpu, &shape, &widths, &rule(options, 0.0))?,
             occupancy: Occupancy::new(gpu, &visit, sizes.has_depth)?,
             samples: SampleBuffers::new(gpu, n_samples)?,
@@ -169,8 +170,8 @@ impl Learner {
         let n_rays = u32::try_from(rays.len()).expect("at most the rays of a step");
         // All steps of a submit have as many rays.
         gpu.write(&self.samples.batch, 0, bytemuck::bytes_of(&Batch::of(n_rays)));
-        let Self { pipelines, field, samples, step: kept, occupancy, moments, slopes, passes: list, .. } = self;
-        let passes = FieldPasses { gpu, pipelines, field, samples, slot };
+        let Self { compiled, field, samples, step: kept, occupancy, moments, slopes, passes: list, .. } = self;
+        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot };
         let first_visit = if self.sizes.has_depth { FIRST_VISIT_WITH_DEPTH } else { VISIT_PERIOD };
         if step.is_multiple_of(VISIT_PERIOD) && step >= first_visit {
             passes.visit(list, occupancy, moments);
@@ -185,8 +186,8 @@ impl Learner {
 
     /// Lists the networks as pictures have them, for the samples of the last step.
     pub(crate) fn record_colors(&mut self, gpu: &Gpu) {
-        let Self { pipelines, field, samples, slots, passes: list, .. } = self;
-        FieldPasses { gpu, pipelines, field, samples, slot: &slots[0] }.colors(list);
+        let Self { compiled, field, samples, slots, passes: list, .. } = self;
+        FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0] }.colors(list);
     }
 
     /// Sends what is listed; the read tells when it is done.
@@ -213,8 +214,9 @@ impl Learner {
         }
         let buffer = gpu.storage_with("nerf.hints", bytemuck::cast_slice(&padded(hints)))?;
         self.make_slot(gpu, 0)?;
-        let Self { pipelines, field, samples, occupancy, moments, slots, passes: list, .. } = self;
-        FieldPasses { gpu, pipelines, field, samples, slot: &slots[0] }.hint(list, occupancy, moments, &buffer);
+        let Self { compiled, field, samples, occupancy, moments, slots, passes: list, .. } = self;
+        FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0] }
+            .hint(list, occupancy, moments, &buffer);
         list.submit(gpu);
         list.forget_bindings(); // The hints are used once.
         Ok(())
@@ -243,8 +245,8 @@ impl Learner {
         gpu.write(&canvas.view, 0, bytemuck::bytes_of(&camera.view()));
         let backdrop = Backdrop { srgb: background_srgb, radius_m: f32_of(radius_m) };
         gpu.write(&canvas.backdrop, 0, bytemuck::bytes_of(&backdrop));
-        let Self { pipelines, field, occupancy, passes: list, sizes, .. } = self;
-        let of_pixels = FieldPasses { gpu, pipelines, field, samples, slot };
+        let Self { compiled, field, occupancy, passes: list, sizes, .. } = self;
+        let of_pixels = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot };
         for first in (0..n_pixels).step_by(slot.n_rays as usize) {
             let n = (n_pixels - first).min(slot.n_rays as usize);
             let [first_ray, n_rays] = [first, n].map(|ix| u32::try_from(ix).expect("an image's pixels"));

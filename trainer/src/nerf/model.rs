@@ -12,7 +12,7 @@ use crate::align::Alignment;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming, PendingRead};
 use crate::splat::{Camera, PosedLens, projections};
-use crate::{Error, Keyframe, Method, Part, Picture, Progress, RenderRequest, Split};
+use crate::{Error, Keyframe, Method, Part, Picture, Progress, RenderRequest, Renewable, Split};
 use kinematics::Stamp;
 use rayon::prelude::*;
 use std::path::Path;
@@ -31,8 +31,8 @@ pub struct NerfModel {
     options: NerfOptions,
     images: Vec<RayImage>,
     field: Option<(Extent, Learner)>,
-    /// For the field that is to come.
-    compiled: Option<Compiled>,
+    /// For all fields that come.
+    compiled: Option<Arc<Compiled>>,
     /// Keyframes came or went since the extent was looked at.
     is_extent_due: bool,
     /// Images whose depth was told to the field: the first so many.
@@ -105,6 +105,16 @@ impl NerfModel {
         Ok((extent, sizes))
     }
 
+    /// The kernels, compiled once.
+    fn compiled(&mut self) -> Result<Arc<Compiled>, Error> {
+        if let Some(compiled) = &self.compiled {
+            return Ok(compiled.clone());
+        }
+        let compiled = Arc::new(Compiled::new(&self.gpu, &self.effort())?);
+        self.compiled = Some(compiled.clone());
+        Ok(compiled)
+    }
+
     fn fit_extent(&mut self) -> Result<(), Error> {
         let (extent, sizes) = self.sizes()?;
         if self.field.as_ref().is_some_and(|(known, _)| !known.is_outgrown_by(&extent)) {
@@ -113,10 +123,7 @@ impl NerfModel {
         log::debug!("nerf: {extent:?}, {sizes:?}");
         self.settle()?;
         self.field = None; // Its memory is free before the next one takes some.
-        let compiled = match self.compiled.take() {
-            Some(compiled) => compiled,
-            None => Compiled::new(&self.gpu, &sizes.effort)?,
-        };
+        let compiled = self.compiled()?;
         self.field = Some((extent, Learner::new(&self.gpu, &self.options, sizes, compiled)?));
         self.n_hinted = 0;
         Ok(())
@@ -168,6 +175,16 @@ impl NerfModel {
             return Ok(Picture::empty(camera.size_px, background_srgb));
         };
         learner.draw(&self.gpu, &extent.camera_in_units(camera), background_srgb, extent.radius_m)
+    }
+}
+
+impl Renewable for NerfModel {
+    fn begin_anew(&mut self) -> Result<(), Error> {
+        self.settle()?;
+        (self.images, self.field) = (Vec::new(), None);
+        (self.is_extent_due, self.n_hinted) = (false, 0);
+        (self.step, self.step_millis) = (0, 0.0);
+        Ok(())
     }
 }
 
@@ -230,10 +247,7 @@ impl Method for NerfModel {
     }
 
     fn prepare(&mut self) -> Result<(), Error> {
-        if self.field.is_none() && self.compiled.is_none() {
-            self.compiled = Some(Compiled::new(&self.gpu, &self.effort())?);
-        }
-        Ok(())
+        self.compiled().map(drop)
     }
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {

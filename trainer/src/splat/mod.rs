@@ -33,5 +33,6 @@ pub(crate) use camera_terms::{drift_share, moved, shares_lens};
 pub use options::SplatOptions;
 pub(crate) use params::{Camera, View};
 pub use trainer::SplatTrainer;
+pub(crate) use trainer::read_about;
 pub use trials::{CameraChoice, Candidate, CountChoice, Trial};
 pub(crate) use views::{depth_in_color_view, median_depth_m};

@@ -953,13 +953,13 @@ fn is_bare(keyframe: &Keyframe) -> bool {
 /// What a saved model knows about cameras.
 #[derive(Default, serde::Deserialize)]
 #[serde(default)]
-struct About {
+pub(crate) struct About {
     cameras: BTreeMap<String, CameraFix>,
-    alignment: Option<Alignment>,
+    pub(crate) alignment: Option<Alignment>,
 }
 
 /// What a saved model knows about cameras; a model without such a file, or of an earlier version, knows nothing.
-fn read_about(path: &Path) -> Result<About, Error> {
+pub(crate) fn read_about(path: &Path) -> Result<About, Error> {
     let refused = |reason: String| Error::SplatFile { path: path.to_owned(), reason };
     match std::fs::read(path) {
         Ok(bytes) => serde_json::from_slice(&bytes).map_err(|error| refused(error.to_string())),

@@ -17,7 +17,7 @@ use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming, Passes, PendingRead};
 use crate::seen::Seen;
 use crate::splat::{Camera, PosedLens, projections};
-use crate::{Error, Keyframe, Method, Part, Picture, Progress, Projection, RenderRequest, Split};
+use crate::{Error, Keyframe, Method, Part, Picture, Progress, Projection, RenderRequest, Renewable, Split};
 use kinematics::Stamp;
 use std::collections::{BTreeSet, VecDeque};
 use std::path::Path;
@@ -306,6 +306,14 @@ fn in_field(camera: &Camera, lattice: &Lattice) -> Camera {
         crop.world_from_box = field_from_world * crop.world_from_box;
     }
     camera
+}
+
+impl Renewable for TsdfModel {
+    fn begin_anew(&mut self) -> Result<(), Error> {
+        self.settle()?;
+        *self = Self::new(self.gpu.clone(), self.options.clone())?;
+        Ok(())
+    }
 }
 
 impl Method for TsdfModel {

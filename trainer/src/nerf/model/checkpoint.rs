@@ -4,7 +4,7 @@ use super::NerfModel;
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::gpu::{Buffer, Gpu, PendingRead};
 use crate::nerf::extent::Extent;
-use crate::nerf::learner::{Compiled, Learner};
+use crate::nerf::learner::Learner;
 use crate::nerf::options::NerfOptions;
 use crate::nerf::rays::RayImage;
 use crate::nerf::sizes::Sizes;
@@ -115,7 +115,7 @@ impl NerfModel {
         let mut model = Self::new(gpu, state.options.clone())?;
         if let Some((extent, sizes)) = &state.field {
             sizes.check()?;
-            let compiled = Compiled::new(&model.gpu, &sizes.effort)?;
+            let compiled = model.compiled()?;
             let learner = Learner::new(&model.gpu, &model.options, sizes.clone(), compiled)?;
             for (name, buffer) in buffers(&learner) {
                 model.gpu.write(buffer, 0, checkpoint.array(&name, buffer.bytes())?);
