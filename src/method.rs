@@ -47,7 +47,7 @@ impl Kind {
     }
 
     /// A model that has seen nothing yet. Of the options a distance field has the memory it may take, a neural field also
-    /// seed and planned steps, and both alignment; what else they want to know they find in the keyframes.
+    /// seed, planned steps and whether poses of images are learned, and both alignment; what else they want to know they find in the keyframes.
     pub(crate) fn start(self, gpu: Arc<Gpu>, options: SplatOptions) -> anyhow::Result<Box<dyn Method>> {
         Ok(match self {
             Self::Splat => Box::new(SplatTrainer::new(gpu, options)?),
@@ -71,7 +71,7 @@ fn tsdf_options(options: &SplatOptions) -> TsdfOptions {
 
 fn nerf_options(options: &SplatOptions) -> NerfOptions {
     let SplatOptions { seed, max_bytes, n_planned_steps, .. } = *options;
-    NerfOptions { seed, max_bytes, n_planned_steps, ..NerfOptions::default() }
+    NerfOptions { seed, max_bytes, n_planned_steps, cameras: options.cameras.clone(), ..NerfOptions::default() }
 }
 
 /// A model that goes on from a checkpoint.
@@ -94,8 +94,8 @@ pub(crate) fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Ke
         return Ok(Resumed { kind: Kind::Tsdf, method, options, rest });
     }
     if checkpoint.method == Kind::Nerf.name() {
-        let NerfOptions { seed, max_bytes, n_planned_steps, .. } = made_with(checkpoint)?;
-        let options = SplatOptions { seed, max_bytes, n_planned_steps, ..SplatOptions::default() };
+        let NerfOptions { seed, max_bytes, n_planned_steps, cameras, .. } = made_with(checkpoint)?;
+        let options = SplatOptions { seed, max_bytes, n_planned_steps, cameras, ..SplatOptions::default() };
         let resume = |own: &Checkpoint, keyframes: &[_]| NerfModel::resume(gpu, own, keyframes);
         let (method, rest) = Aligned::resume(checkpoint, keyframes, resume)?;
         return Ok(Resumed { kind: Kind::Nerf, method, options, rest });

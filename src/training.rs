@@ -1,6 +1,6 @@
 //! One training from keyframes on disk to a model: what `train` does once, and `bench` many times over.
 
-use crate::config::USUAL_SEED;
+use crate::config::{Rig, USUAL_SEED};
 use crate::data::Data;
 use crate::exit::{BadArgument, LackOfEvidence};
 use crate::method::{self, Kind};
@@ -62,8 +62,11 @@ pub(crate) fn model(
     };
     args.check_for(kind)?;
     // A trial takes hundreds of steps more: on a processor that is minutes.
-    let evidence =
-        Evidence { joints: data.rig.is_some(), depth: data.keyframes.iter().any(|keyframe| keyframe.depth.is_some()) };
+    let evidence = Evidence {
+        joints: data.rig.is_some(),
+        drifts: data.rig.as_ref().is_none_or(Rig::has_moving_base),
+        depth: data.keyframes.iter().any(|keyframe| keyframe.depth.is_some()),
+    };
     let Refining { align, learn: cameras } =
         args.refining(evidence, if software { Refine::None } else { Refine::Auto })?;
     args.check_learned(kind, evidence)?;

@@ -69,9 +69,10 @@ pub(crate) struct Refining {
 /// What data have that cameras could be refined by.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Evidence {
-    /// Poses come from the joints of an arm: they are wrong in what all images share. Those of a SLAM system drift from
-    /// image to image.
+    /// Poses come from a recording's joints, which are wrong in what all images share.
     pub(crate) joints: bool,
+    /// Poses come from a SLAM system, or from a base that has one: they drift from image to image.
+    pub(crate) drifts: bool,
     /// Keyframes, known from the start, with depth.
     pub(crate) depth: bool,
 }
@@ -88,15 +89,17 @@ impl TrainingArgs {
         }
     }
 
-    /// Refuses terms that were asked for and that only splats learn: those that come along with the scene.
+    /// Refuses terms that were asked for and that the scene model does not learn: those that come along with the scene.
     pub(crate) fn check_learned(&self, kind: Kind, evidence: Evidence) -> Result<(), BadArgument> {
         let can_align = |term: &Refine| evidence.depth && *term != Refine::ImageGains;
-        let is_left = |term: &Refine| matches!(term, Refine::Auto | Refine::None) || can_align(term);
+        let can_learn = |term: &Refine| kind == Kind::Nerf && *term == Refine::ImagePoses;
+        let is_left = |term: &Refine| matches!(term, Refine::Auto | Refine::None) || can_align(term) || can_learn(term);
         if kind == Kind::Splat || self.refine.iter().all(is_left) {
             return Ok(());
         }
+        let along = if kind == Kind::Nerf { ", learns image-poses along" } else { "" };
         Err(BadArgument(format!(
-            "--refine: the method {} corrects cameras by laying images with depth over each other at the start, and no others",
+            "--refine: the method {} corrects cameras by laying images with depth over each other at the start{along}, and no others",
             kind.name()
         )))
     }
@@ -174,11 +177,9 @@ impl Evidence {
         let gains = TermSet { image_gains: true, ..TermSet::NONE };
         let poses = TermSet { image_poses: true, ..TermSet::NONE };
         let learn = match self {
-            Self { joints: true, depth: true } => vec![gains],
-            Self { joints: true, depth: false } => {
-                vec![gains, TermSet { mount: true, delay: true, ..TermSet::NONE }]
-            }
-            Self { joints: false, .. } => vec![gains, poses],
+            Self { drifts: true, .. } => vec![gains, poses],
+            Self { depth: true, .. } => vec![gains],
+            Self { depth: false, .. } => vec![gains, TermSet { mount: true, delay: true, ..TermSet::NONE }],
         };
         Refining {
             align: CameraChoice::Try(if self.depth { align::candidates() } else { Vec::new() }),
@@ -200,7 +201,7 @@ mod tests {
             refine: asked.to_vec(),
             count: None,
         };
-        args.refining(Evidence { joints, depth }, Refine::None).map_err(|error| error.to_string())
+        args.refining(Evidence { joints, drifts: !joints, depth }, Refine::None).map_err(|error| error.to_string())
     }
 
     #[test]

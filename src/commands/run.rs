@@ -103,7 +103,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let rig = Rig::load(&args.rig_file, &args.overrides())?;
     let kind = Kind::of_rig(&rig)?;
     args.training.check_for(kind)?;
-    let evidence = Evidence { joints: true, depth: false }; // Depth comes, but not at the start.
+    let evidence = Evidence { joints: true, drifts: rig.has_moving_base(), depth: false }; // Depth comes, but not at the start.
     args.training.check_learned(kind, evidence)?;
     let pace = args.pace(&rig)?;
     let hub = Hub::new();

@@ -257,6 +257,11 @@ impl Override {
 }
 
 impl Rig {
+    /// Whether poses of the base come from a device, with its errors.
+    pub(crate) fn has_moving_base(&self) -> bool {
+        self.base.driver != BaseDriver::Fixed
+    }
+
     /// Reads and checks a rig file and the robot's description that it names.
     pub(crate) fn load(path: &Path, overrides: &[Override]) -> Result<Self, ConfigError> {
         let text = read_file("the rig file", path)?;

@@ -5,7 +5,7 @@
 use crate::align::{Aligning, Alignment, taken_at};
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::gpu::PassTiming;
-use crate::splat::{CameraChoice, PosedLens, read_about};
+use crate::splat::{CameraChoice, CameraFix, PosedLens, read_about};
 use crate::{Error, Keyframe, Method, Part, Picture, Progress, RenderRequest};
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
@@ -20,6 +20,10 @@ const ABOUT_KEY: &str = "alignment";
 pub trait Renewable: Method {
     /// Forgets all keyframes and all that was learned; what is compiled may stay.
     fn begin_anew(&mut self) -> Result<(), Error>;
+    /// What was learned about a camera along with the scene, from keyframes as they are pushed; none where nothing is.
+    fn learned_fix(&mut self, _camera: &str) -> Result<Option<CameraFix>, Error> {
+        Ok(None)
+    }
 }
 
 /// A model that goes on from a checkpoint, and the keyframes that it had not learned from.
@@ -157,7 +161,8 @@ impl<M: Renewable + 'static> Method for Aligned<M> {
     }
 
     fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {
-        Ok(self.aligning.posed_lens(keyframe, None))
+        let learned = self.model.learned_fix(&keyframe.camera)?;
+        Ok(self.aligning.posed_lens(keyframe, learned.as_ref()))
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {

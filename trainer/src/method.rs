@@ -23,7 +23,7 @@ pub struct Progress {
 }
 
 /// What a part of the model was found to be worth, on images held back for it.
-#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Part {
     /// What it is, in words.
     pub part: String,

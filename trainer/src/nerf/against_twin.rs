@@ -1,11 +1,12 @@
 //! The kernels against their twins in f64.
 
-use super::buffers::{FieldBuffers, FieldMoments, FieldSlopes, RaySlot, SampleBuffers, StepBuffers};
+use super::buffers::{FieldBuffers, FieldMoments, FieldSlopes, PoseBuffers, RaySlot, SampleBuffers, StepBuffers};
 use super::kernels::{FieldPipelines, KERNELS, N_CHUNK, Widths};
-use super::params::{self, Batch, LearnRule, Level, RayLoss, Span};
+use super::params::{self, Batch, LearnRule, Level, PoseRule, RayLoss, Span};
 use super::passes::FieldPasses;
 use super::reference::field::{Field, FieldGrad};
 use super::reference::network::Network;
+use super::reference::pose::ImagePose;
 use super::reference::ray as reference;
 use super::reference::scene::{N_CODE, Ray, WEIGHTS, field, gradient, ray, samples};
 use super::reference::space::contract;
@@ -219,6 +220,96 @@ fn pictures_and_gradients_match_the_twin() {
     }
 }
 
+/// Slopes towards the poses of images, and the first step of each: images of seven rays, the last of fewer.
+#[test]
+fn slopes_towards_poses_match_the_twin() {
+    const RAYS_PER_IMAGE: usize = 7;
+    const N_IMAGES: usize = (N_RAYS as usize).div_ceil(RAYS_PER_IMAGE);
+    let (twin, rays) = (field(7), rays());
+    for options in forms() {
+        let bench = bench(&options, &twin, &rays, &vec![1.0; twin.shape.n_cells.len()]);
+        let Bench { gpu, pipelines, widths, field, samples: batch, step, slopes, slot } = &bench;
+        let passes = FieldPasses { gpu, pipelines, field, samples: batch, slot };
+        let rule = LearnRule {
+            rate: 1.0,
+            final_rate_frac: 1.0,
+            betas: [0.9, 0.99],
+            epsilon: 1e-15,
+            pull: 0.0,
+            n_planned_steps: 1.0,
+            unused: 0.0,
+        };
+        let moments = FieldMoments::new(gpu, &twin.shape, widths, &rule).unwrap();
+        let n_images = u32::try_from(N_IMAGES + 1).unwrap(); // One has no rays.
+        let rule = PoseRule { turn_rate: 0.25, shift_rate: 0.125, pull: 0.5, n_images };
+        let poses = PoseBuffers::new(gpu, &rule, N_RAYS + 3, batch.n_samples).unwrap();
+        let mut list = Passes::default();
+        passes.forward(&mut list, step);
+        passes.backward(&mut list, step, slopes);
+        list.submit(gpu);
+        let mut of_images: Vec<params::Ray> = gpu.read(&slot.rays, rays.len()).unwrap();
+        for (ix, ray) in of_images.iter_mut().enumerate() {
+            ray.code = u32::try_from(ix / RAYS_PER_IMAGE).unwrap();
+        }
+        gpu.write(&slot.rays, 0, bytemuck::cast_slice(&of_images));
+        passes.learn_poses(&mut list, step, &moments, &poses);
+        list.submit(gpu);
+
+        let expected: Vec<ImagePose> = rays
+            .iter()
+            .map(|ray| {
+                let (_, places, _) = gradient(&twin, ray);
+                let ImagePose { turn_rad, shift } = ImagePose::slopes(ray.direction, &places);
+                let mean = |v: f64| v / f64::from(N_RAYS);
+                ImagePose { turn_rad: turn_rad.map(mean), shift: shift.map(mean) }
+            })
+            .collect();
+        let parts = |pose: &ImagePose| [pose.turn_rad, pose.shift];
+        let largest = expected.iter().flat_map(parts).flatten().fold(0.0f64, |most, v| most.max(v.abs()));
+        let mut wrong = Mismatches::default();
+        let got: Vec<[[f32; 4]; 2]> = gpu.read(&poses.v_rays, rays.len()).unwrap();
+        for (ix, (got, expected)) in got.iter().zip(&expected).enumerate() {
+            for (part, (got, expected)) in got.iter().zip(parts(expected)).enumerate() {
+                for axis in 0..3 {
+                    let what = format!("ray {ix}, part {part}, axis {axis}");
+                    wrong.check(what, got[axis].into(), expected[axis], 2e-5 * largest, 2e-4);
+                }
+            }
+        }
+        let terms: Vec<[params::Term; params::TERM_STRIDE]> = gpu.read(&poses.terms, N_IMAGES + 1).unwrap();
+        for (image, of_image) in expected.chunks(RAYS_PER_IMAGE).enumerate() {
+            for term in 0..params::TERMS {
+                let sum: f64 = of_image.iter().map(|pose| parts(pose).as_flattened()[term]).sum();
+                let [value, first, second, n_steps] = terms[image][term].map(f64::from);
+                let what = |name: &str| format!("image {image}, term {term}, {name}");
+                wrong.check(what("slope"), first / 0.1, sum, 5e-5 * largest, 2e-4);
+                wrong.check(what("square"), second / 0.01, (first / 0.1).powi(2), 1e-12, 1e-4);
+                let rate = if term < 3 { 0.25 } else { 0.125 };
+                // A first step goes as far as the rate says, and half of it is pulled back.
+                wrong.check(what("value"), value, -0.5 * rate * first.signum(), 1e-6, 1e-5);
+                wrong.check(what("steps"), n_steps, 1.0, 1e-9, 0.0);
+            }
+        }
+        wrong.assert_none();
+        assert_eq!(terms[N_IMAGES], [[0.0; 4]; params::TERM_STRIDE], "an image without rays stays where it is");
+
+        gpu.write(&slot.rays, 0, bytemuck::cast_slice(&of_images));
+        passes.aim(&mut list, &poses);
+        list.submit(gpu);
+        let aimed: Vec<params::Ray> = gpu.read(&slot.rays, rays.len()).unwrap();
+        for (ix, (ray, got)) in rays.iter().zip(aimed).enumerate() {
+            let value = |term: usize| f64::from(terms[ix / RAYS_PER_IMAGE][term][0]);
+            let pose = ImagePose { turn_rad: [0, 1, 2].map(value), shift: [3, 4, 5].map(value) };
+            let (origin, direction) = pose.aim(ray.origin, ray.direction);
+            for axis in 0..3 {
+                wrong.check(format!("origin {ix} {axis}"), got.origin[axis].into(), origin[axis], 1e-6, 1e-6);
+                wrong.check(format!("direction {ix} {axis}"), got.direction[axis].into(), direction[axis], 1e-6, 1e-6);
+            }
+        }
+        wrong.assert_none();
+    }
+}
+
 /// Steps of both, each from its own gradients.
 #[test]
 fn steps_of_learning_match_the_twin() {
@@ -318,6 +409,7 @@ fn every_kernel_parses_and_validates_and_structs_have_the_same_layout() {
                 Some("Level") => size_of::<Level>(),
                 Some("RayLoss") => size_of::<RayLoss>(),
                 Some("Pace") => size_of::<params::Pace>(),
+                Some("PoseRule") => size_of::<PoseRule>(),
                 Some("LearnRule") => size_of::<LearnRule>(),
                 _ => continue,
             };

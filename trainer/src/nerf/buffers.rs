@@ -1,7 +1,7 @@
 //! What the field and its samples take on the GPU.
 
 use super::kernels::{N_CHUNK, N_TILE, Widths};
-use super::params::{Batch, LearnRule, Level, March, Ray, RayLoss, Visit, levels};
+use super::params::{Batch, LearnRule, Level, March, PoseRule, Ray, RayLoss, TERM_STRIDE, Term, Visit, levels};
 use super::reference::grid::GridShape;
 use crate::Error;
 use crate::gpu::{Buffer, Gpu};
@@ -141,6 +141,32 @@ pub(crate) struct StepBuffers {
     pub(crate) ray_errors: Buffer,
     /// Slopes towards the weights, of each chunk of samples.
     pub(crate) partial_sums: Buffer,
+}
+
+/// What is learned about the poses of images, and the slopes towards them.
+#[derive(Debug)]
+pub(crate) struct PoseBuffers {
+    /// `[n_images, TERM_STRIDE]`.
+    pub(crate) terms: Buffer,
+    pub(crate) rule: Buffer,
+    pub(crate) n_images: u32,
+    /// Of each sample and of each ray.
+    pub(crate) v_points: Buffer,
+    pub(crate) v_rays: Buffer,
+}
+
+impl PoseBuffers {
+    /// Of images whose poses are right as far as anyone knows.
+    pub(crate) fn new(gpu: &Gpu, rule: &PoseRule, n_rays: u32, n_samples: u32) -> Result<Self, Error> {
+        let n_images = rule.n_images;
+        Ok(Self {
+            terms: gpu.storage("nerf.terms", u64::from(n_images) * (TERM_STRIDE * size_of::<Term>()) as u64)?,
+            rule: gpu.uniform_with("nerf.pose_rule", rule),
+            n_images,
+            v_points: gpu.storage("nerf.v_points", 16 * u64::from(n_samples))?,
+            v_rays: gpu.storage("nerf.v_rays", 32 * u64::from(n_rays))?,
+        })
+    }
 }
 
 impl FieldBuffers {

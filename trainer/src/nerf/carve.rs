@@ -12,6 +12,9 @@ const LOOKED_THROUGH: u32 = 1 << 30;
 const SURFACE: u32 = 2 << 30;
 /// Where rays that meet nothing end, in units of the scene's radius.
 const NOWHERE: f64 = 50.0;
+/// Readings from one ray that is followed to the next: readings are told of every half cell, and so is where nothing was read, but what is
+/// empty before readings need be told once.
+const READINGS_PER_RAY: u32 = 4;
 /// Share of the distance that a reading may be off by: so far in front of it nothing is taken for free.
 const OFF_FRAC: f64 = 0.03;
 
@@ -48,6 +51,14 @@ impl CellSet {
             .filter(|(_, word)| *word != 0)
             .flat_map(|(ix, word)| (0..64).filter(move |bit| word >> bit & 1 == 1).map(move |bit| 64 * ix + bit))
     }
+}
+
+/// Origin and direction of a ray, in units of the radius.
+type RayOf = ([f64; 3], [f64; 3]);
+
+/// Of the cell around a point, drawn in as it is.
+fn cell_width(march: &March, point: [f64; 3]) -> f64 {
+    4.0 / march.n_cells as f64 * largest(point).1.max(1.0).powi(2)
 }
 
 /// What depth images tell about cells, each told once.
@@ -92,18 +103,23 @@ impl Cells {
                 let along = depth.point(x, y, 1.0);
                 let z_m = f64::from(depth.depth_m[(y * width + x) as usize]);
                 let reading_m = if z_m.is_finite() && z_m > 0.0 { z_m * along.norm() } else { 0.0 };
-                let direction = (depth.world_from_camera.rotation * along.normalize()).into();
-                self.walk(march, (origin, direction), reading_m / extent.radius_m);
+                let ray = (origin, (depth.world_from_camera.rotation * along.normalize()).into());
+                let is_open = reading_m == 0.0;
+                if is_open || [x, y].into_iter().all(|at| (at / stride).is_multiple_of(READINGS_PER_RAY)) {
+                    self.walk(march, ray, reading_m / extent.radius_m);
+                }
+                if !is_open {
+                    self.meet(march, ray, reading_m / extent.radius_m);
+                }
             }
         }
     }
 
     /// Follows a ray to its reading; to nowhere where that is 0.
-    fn walk(&mut self, march: &March, (origin, direction): ([f64; 3], [f64; 3]), distance: f64) {
+    fn walk(&mut self, march: &March, (origin, direction): RayOf, distance: f64) {
         let point = |t: f64| std::array::from_fn(|axis| origin[axis] + t * direction[axis]);
         let cell = |t: f64| march.cell(point(t)).0;
-        // Of a cell, drawn in as it is.
-        let width = |t: f64| 4.0 / march.n_cells as f64 * largest(point(t)).1.max(1.0).powi(2);
+        let width = |t: f64| cell_width(march, point(t));
         let is_open = distance == 0.0;
         let end = if is_open { NOWHERE } else { distance * (1.0 - OFF_FRAC) - width(distance) };
         let passed = if is_open { &mut self.without_end } else { &mut self.free };
@@ -112,10 +128,14 @@ impl Cells {
             passed.insert(cell(t));
             t += 0.5 * width(t);
         }
-        if !is_open {
-            for part in [-1.0, -0.5, 0.0, 0.5, 1.0] {
-                self.surfaces.insert(cell((distance + part * width(distance)).max(0.0)));
-            }
+    }
+
+    /// Takes note of what a reading lies in, and of a cell before and behind it.
+    fn meet(&mut self, march: &March, (origin, direction): RayOf, distance: f64) {
+        let point = |t: f64| std::array::from_fn(|axis| origin[axis] + t * direction[axis]);
+        let width = cell_width(march, point(distance));
+        for part in [-1.0, -0.5, 0.0, 0.5, 1.0] {
+            self.surfaces.insert(march.cell(point((distance + part * width).max(0.0))).0);
         }
     }
 }

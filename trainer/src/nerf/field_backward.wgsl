@@ -27,6 +27,7 @@
 // One contribution is at most this: 2^7 of them fit into a sum.
 const MOST = 16777216.0;
 const NOT_CUT = 0xffffffffu;
+const NOT_KEPT = 0xffffffffu;
 const N_OF_COLOR = 3u;             // layers of the second network
 const N_LAYERS = 5u;
 
@@ -40,7 +41,7 @@ struct Layer {
     n_in: u32,
     n_out: u32,
     cut_row: u32,          // what came in, which was cut at zero; NOT_CUT: it was not
-    kept_row: u32,
+    kept_row: u32,         // NOT_KEPT: nobody needs them
 }
 
 // From the last one on.
@@ -48,9 +49,9 @@ fn layer_of(ix: u32) -> Layer {
     switch ix {
         case 0u: { return Layer(0u, color_weights(), N_HIDDEN, N_COLORS, hidden_2_row(), v_hidden_2_row()); }
         case 1u: { return Layer(BANK, hidden_2_weights(), N_HIDDEN, N_HIDDEN, hidden_1_row(), v_hidden_1_row()); }
-        case 2u: { return Layer(0u, hidden_1_weights(), N_COLOR_IN, N_HIDDEN, NOT_CUT, 0u); }
+        case 2u: { return Layer(0u, hidden_1_weights(), N_COLOR_IN, N_HIDDEN, NOT_CUT, NOT_KEPT); }
         case 3u: { return Layer(0u, told_weights(), N_HIDDEN, N_TOLD, hidden_0_row(), 0u); }
-        default: { return Layer(BANK, 0u, N_FEATURES, N_HIDDEN, NOT_CUT, 0u); }
+        default: { return Layer(BANK, 0u, N_FEATURES, N_HIDDEN, NOT_CUT, v_features_row()); }
     }
 }
 
@@ -73,8 +74,8 @@ fn work_out(layer: Layer, tile: u32, lane: u32) {
             if layer.cut_row != NOT_CUT {
                 let was = held[(tile * n_held_rows() + layer.cut_row + row) * PARTS + part];
                 sum = select(vec4f(0.0), sum, was > vec4f(0.0));
-                keep(tile, layer.kept_row + row, part, sum);
             }
+            if layer.kept_row != NOT_KEPT { keep(tile, layer.kept_row + row, part, sum); }
             wg_rows[(BANK - layer.from_bank) + row * STRIDE + part] = sum;
         }
     }

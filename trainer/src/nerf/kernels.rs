@@ -31,6 +31,7 @@ const SHARED: &[Source] = &[
     shared!("visit"),
     shared!("random"),
     shared!("hash_grid"),
+    shared!("image_terms"),
     shared!("network_tile"),
     shared!("ray_loss"),
     shared!("learn_rule"),
@@ -55,6 +56,10 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("field_forward"),
     kernel!("composite"),
     kernel!("field_backward"),
+    kernel!("aim_rays"),
+    kernel!("point_slopes"),
+    kernel!("ray_slopes"),
+    kernel!("learn_poses"),
     kernel!("weight_slopes"),
     kernel!("learn_weights"),
     kernel!("learn_grid"),
@@ -105,9 +110,9 @@ impl Widths {
         self.layers().iter().map(|[n_in, _]| n_in).sum()
     }
 
-    /// Slopes of a sample: towards what comes out of each layer.
+    /// Slopes of a sample: towards what comes out of each layer, and towards what the grid holds.
     pub(crate) fn n_slopes(&self) -> u32 {
-        self.layers().iter().map(|[_, n_out]| n_out).sum()
+        self.layers().iter().map(|[_, n_out]| n_out).sum::<u32>() + self.n_features
     }
 }
 
@@ -133,6 +138,10 @@ pub(crate) struct FieldPipelines {
     pub(crate) forward: Pipeline,
     pub(crate) composite: Pipeline,
     pub(crate) field_backward: Pipeline,
+    pub(crate) aim_rays: Pipeline,
+    pub(crate) point_slopes: Pipeline,
+    pub(crate) ray_slopes: Pipeline,
+    pub(crate) learn_poses: Pipeline,
     pub(crate) weight_slopes: Pipeline,
     pub(crate) learn_weights: Pipeline,
     pub(crate) learn_grid: Pipeline,
@@ -186,6 +195,10 @@ impl FieldPipelines {
             forward: learned?,
             composite: plain(kernel!("composite"))?,
             field_backward: field_backward?,
+            aim_rays: plain(kernel!("aim_rays"))?,
+            point_slopes: Pipeline::new(gpu, kernel!("point_slopes"), &sizes)?,
+            ray_slopes: plain(kernel!("ray_slopes"))?,
+            learn_poses: plain(kernel!("learn_poses"))?,
             weight_slopes: weight_slopes?,
             learn_weights: Pipeline::new(gpu, kernel!("learn_weights"), &[("CHUNK", f64::from(N_CHUNK))])?,
             learn_grid: plain(kernel!("learn_grid"))?,

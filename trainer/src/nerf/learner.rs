@@ -1,9 +1,11 @@
 //! A field on the GPU that learns from rays and draws pictures.
 
-use super::buffers::{FieldBuffers, FieldMoments, FieldSlopes, Occupancy, RaySlot, SampleBuffers, StepBuffers};
+use super::buffers::{
+    FieldBuffers, FieldMoments, FieldSlopes, Occupancy, PoseBuffers, RaySlot, SampleBuffers, StepBuffers,
+};
 use super::kernels::{FieldPipelines, Widths};
 use super::options::{Effort, NerfOptions};
-use super::params::{Backdrop, Batch, LearnRule, March, Ray, RayLoss, Visit};
+use super::params::{Backdrop, Batch, LearnRule, March, PoseRule, Ray, RayLoss, TERM_STRIDE, TERMS, Term, Visit};
 use super::passes::{Canvas, FieldPasses};
 use super::rays::{mixed, unit};
 use super::reference::march as reference;
@@ -39,6 +41,12 @@ const DISTANCE_CLIP: f32 = 0.5;
 const BAND_FRAC: f32 = 0.01;
 /// Where the places of the spread begin, in units of the radius.
 const SPREAD_NEAR: f32 = 0.05;
+/// How far an image turns in a step at the start, radians, and is shifted, units of the radius: what is looked at is a third of
+/// a radius away, roughly.
+const TURN_RATE: f32 = 5e-4;
+const SHIFT_RATE: f32 = TURN_RATE / 3.0;
+/// Share of an image's turn and shift that is lost in a step at the start.
+const POSE_PULL: f32 = 5e-4;
 /// Scale of slopes at the start, before their sizes are known.
 const FIRST_SCALE: f32 = 1_048_576.0;
 
@@ -53,6 +61,8 @@ pub(crate) struct Learner {
     pub(crate) moments: FieldMoments,
     pub(crate) slopes: FieldSlopes,
     pub(crate) occupancy: Occupancy,
+    /// Where the poses of images are learned.
+    pub(crate) poses: Option<PoseBuffers>,
     compiled: Arc<Compiled>,
     samples: SampleBuffers,
     step: StepBuffers,
@@ -93,6 +103,7 @@ impl Learner {
             compiled,
             moments: FieldMoments::new(gpu, &shape, &widths, &rule(options, 0.0))?,
             occupancy: Occupancy::new(gpu, &visit, sizes.has_depth)?,
+            poses: None,
             samples: SampleBuffers::new(gpu, n_samples)?,
             step: StepBuffers::new(gpu, &widths, n_rays, n_samples)?,
             slots: Vec::new(),
@@ -143,6 +154,101 @@ impl Learner {
         step: u64,
         rays: &[Ray],
     ) -> Result<(), Error> {
+        self.write_slot(gpu, options, slot_ix, step, rays)?;
+        let Self { compiled, field, samples, step: kept, occupancy, moments, slopes, poses, passes: list, .. } = self;
+        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &self.slots[slot_ix] };
+        let first_visit = if self.sizes.has_depth { FIRST_VISIT_WITH_DEPTH } else { VISIT_PERIOD };
+        if step.is_multiple_of(VISIT_PERIOD) && step >= first_visit {
+            passes.visit(list, occupancy, moments);
+        }
+        if let Some(poses) = poses {
+            passes.aim(list, poses);
+        }
+        passes.count(list, occupancy);
+        passes.place(list, occupancy);
+        passes.forward(list, kept);
+        passes.backward(list, kept, slopes);
+        if let Some(poses) = poses {
+            passes.learn_poses(list, kept, moments, poses);
+        }
+        passes.learn(list, [&self.rules[0], &self.rules[1]], kept, slopes, moments);
+        Ok(())
+    }
+
+    /// Squared difference of color of each of some rays, as they are given: nothing is learned. What was sent must be done.
+    pub(crate) fn errors(&mut self, gpu: &Gpu, options: &NerfOptions, rays: &[Ray]) -> Result<Vec<f32>, Error> {
+        self.write_slot(gpu, options, 0, 0, rays)?;
+        let Self { compiled, field, samples, step: kept, occupancy, slots, passes: list, .. } = self;
+        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0] };
+        passes.count(list, occupancy);
+        passes.place(list, occupancy);
+        passes.forward(list, kept);
+        passes.composite(list, kept);
+        list.submit(gpu);
+        let seen: Vec<[f32; 2]> = gpu.read(&kept.ray_errors, rays.len())?;
+        Ok(seen.into_iter().map(|[error, _]| error).collect())
+    }
+
+    /// Lets the poses of so many images be learned from here on; those that are learned already stay.
+    pub(crate) fn hold_poses(&mut self, gpu: &Gpu, n_images: usize) -> Result<(), Error> {
+        let n_images = u32::try_from(n_images).expect("few images");
+        if self.poses.as_ref().is_some_and(|poses| poses.n_images >= n_images) {
+            return Ok(());
+        }
+        let rule = PoseRule {
+            turn_rate: TURN_RATE,
+            shift_rate: SHIFT_RATE,
+            pull: POSE_PULL,
+            n_images: n_images.next_power_of_two(),
+        };
+        self.passes.forget_bindings();
+        let Effort { n_rays, n_samples, .. } = self.sizes.effort;
+        let poses = PoseBuffers::new(gpu, &rule, n_rays, n_samples)?;
+        if let Some(known) = self.poses.replace(poses)
+            && let Some(poses) = &self.poses
+        {
+            gpu.copy((&known.terms, 0), (&poses.terms, 0), known.terms.bytes());
+        }
+        Ok(())
+    }
+
+    /// Turn (rotation vector in world, radians) and shift (in world, units of the radius) of the first images; empty where poses are
+    /// not learned.
+    pub(crate) fn image_poses(&self, gpu: &Gpu, n_images: usize) -> Result<Vec<[f64; TERMS]>, Error> {
+        let Some(poses) = &self.poses else { return Ok(Vec::new()) };
+        let n = n_images.min(poses.n_images as usize);
+        let terms: Vec<[Term; TERM_STRIDE]> = gpu.read(&poses.terms, n)?;
+        let values = |image: &[Term; TERM_STRIDE]| std::array::from_fn(|ix| f64::from(image[ix][0]));
+        Ok(terms.iter().map(values).collect())
+    }
+
+    /// Poses are right as they are given.
+    pub(crate) fn forget_poses(&mut self) {
+        self.passes.forget_bindings();
+        self.poses = None;
+    }
+
+    /// Forgets the pose of an image; those after it move up.
+    pub(crate) fn forget_pose(&mut self, gpu: &Gpu, image_ix: usize) -> Result<(), Error> {
+        let Some(poses) = &self.poses else { return Ok(()) };
+        let mut terms: Vec<[Term; TERM_STRIDE]> = gpu.read(&poses.terms, poses.n_images as usize)?;
+        if image_ix < terms.len() {
+            terms.remove(image_ix);
+            terms.push([[0.0; 4]; TERM_STRIDE]);
+        }
+        gpu.write(&poses.terms, 0, bytemuck::cast_slice(&terms));
+        Ok(())
+    }
+
+    /// What a step of some rays reads, as the `slot_ix`-th of a submit.
+    fn write_slot(
+        &mut self,
+        gpu: &Gpu,
+        options: &NerfOptions,
+        slot_ix: usize,
+        step: u64,
+        rays: &[Ray],
+    ) -> Result<(), Error> {
         let Effort { n_rays, n_samples, .. } = self.sizes.effort;
         self.make_slot(gpu, slot_ix)?;
         let slot = &self.slots[slot_ix];
@@ -170,17 +276,6 @@ impl Learner {
         let n_rays = u32::try_from(rays.len()).expect("at most the rays of a step");
         // All steps of a submit have as many rays.
         gpu.write(&self.samples.batch, 0, bytemuck::bytes_of(&Batch::of(n_rays)));
-        let Self { compiled, field, samples, step: kept, occupancy, moments, slopes, passes: list, .. } = self;
-        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot };
-        let first_visit = if self.sizes.has_depth { FIRST_VISIT_WITH_DEPTH } else { VISIT_PERIOD };
-        if step.is_multiple_of(VISIT_PERIOD) && step >= first_visit {
-            passes.visit(list, occupancy, moments);
-        }
-        passes.count(list, occupancy);
-        passes.place(list, occupancy);
-        passes.forward(list, kept);
-        passes.backward(list, kept, slopes);
-        passes.learn(list, [&self.rules[0], &self.rules[1]], kept, slopes, moments);
         Ok(())
     }
 

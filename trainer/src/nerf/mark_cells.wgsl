@@ -13,12 +13,13 @@
 
 // A step through a cell that holds back less is left out, unless most hold back little: then half of their mean.
 const ENOUGH = 0.02;
+const MOST_SUM = 4294967040.0; // Of `sum_cells`: all cells hold back everything.
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let word = folded(wg, n_wgs) * 64u + lane;
     if 32u * word >= arrayLength(&thickness) { return; }
-    let mean = f32(thickness_sum[0]) / 1024.0 / f32(arrayLength(&thickness));
+    let mean = f32(thickness_sum[0]) / MOST_SUM;
     let enough = min(ENOUGH, 0.5 * mean);
     var bits = 0u;
     for (var bit = 0u; bit < 32u; bit++) {

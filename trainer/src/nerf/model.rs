@@ -1,6 +1,7 @@
 //! The neural field as a [`Method`].
 
 mod checkpoint;
+mod poses;
 
 use super::carve;
 use super::extent::Extent;
@@ -11,10 +12,12 @@ use super::sizes::Sizes;
 use crate::align::Alignment;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming, PendingRead};
-use crate::splat::{Camera, PosedLens, projections};
+use crate::splat::{Camera, CameraFix, PosedLens, TermSet, projections};
 use crate::{Error, Keyframe, Method, Part, Picture, Progress, RenderRequest, Renewable, Split};
 use kinematics::Stamp;
+use poses::Trial;
 use rayon::prelude::*;
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
@@ -38,7 +41,20 @@ pub struct NerfModel {
     /// Images whose depth was told to the field: the first so many.
     n_hinted: usize,
     in_flight: Option<InFlight>,
+    /// Whether the poses of images are learned along.
+    learns_poses: bool,
+    trial: Trial,
+    /// Images that are learned from when the trial is over.
+    held_back: Vec<RayImage>,
+    /// What the trial found.
+    part: Option<Part>,
+    /// Of the saved field this one came from.
+    loaded_fixes: BTreeMap<String, CameraFix>,
+    /// What is known about cameras, since the last step.
+    fixes: Option<BTreeMap<String, CameraFix>>,
     step: u64,
+    /// Steps of trials that were taken back.
+    n_taken_back: u64,
     step_millis: f64,
 }
 
@@ -52,11 +68,17 @@ struct InFlight {
 impl NerfModel {
     /// A model that has seen nothing.
     pub fn new(gpu: Arc<Gpu>, options: NerfOptions) -> Result<Self, Error> {
-        let images = Vec::new();
         Ok(Self {
             gpu,
+            learns_poses: options.cameras.gives(TermSet { image_poses: true, ..TermSet::NONE }),
+            trial: Trial::of(&options.cameras),
             options,
-            images,
+            images: Vec::new(),
+            held_back: Vec::new(),
+            part: None,
+            loaded_fixes: BTreeMap::new(),
+            fixes: None,
+            n_taken_back: 0,
             field: None,
             compiled: None,
             is_extent_due: false,
@@ -75,6 +97,15 @@ impl NerfModel {
     /// Where the scene lies; `None` before the first keyframe is learned from.
     pub fn extent(&self) -> Option<&Extent> {
         self.field.as_ref().map(|(extent, _)| extent)
+    }
+
+    /// What was learned about each camera; empty where nothing is.
+    fn camera_fixes(&mut self) -> Result<&BTreeMap<String, CameraFix>, Error> {
+        if self.fixes.is_none() {
+            self.settle()?;
+            self.fixes = Some(self.learned_fixes()?);
+        }
+        Ok(self.fixes.as_ref().filter(|fixes| !fixes.is_empty()).unwrap_or(&self.loaded_fixes))
     }
 
     fn effort(&self) -> Effort {
@@ -122,6 +153,7 @@ impl NerfModel {
         }
         log::debug!("nerf: {extent:?}, {sizes:?}");
         self.settle()?;
+        self.give_up_trial();
         self.field = None; // Its memory is free before the next one takes some.
         let compiled = self.compiled()?;
         self.field = Some((extent, Learner::new(&self.gpu, &self.options, sizes, compiled)?));
@@ -151,7 +183,12 @@ impl NerfModel {
 
     /// Lists the next step as the `slot_ix`-th of a submit.
     fn record(&mut self, slot_ix: usize) -> Result<(), Error> {
+        let moves_images = self.moves_images();
         let Some((extent, learner)) = &mut self.field else { return Ok(()) };
+        if moves_images {
+            learner.hold_poses(&self.gpu, self.images.len())?;
+        }
+        self.fixes = None;
         let n_rays = learner.sizes.effort.n_rays;
         let draw = Draw { seed: self.options.seed, step: self.step, n_rays, begin: BEGIN };
         let rays = rays::draw(&self.images, extent, &draw);
@@ -181,10 +218,13 @@ impl NerfModel {
 impl Renewable for NerfModel {
     fn begin_anew(&mut self) -> Result<(), Error> {
         self.settle()?;
-        (self.images, self.field) = (Vec::new(), None);
-        (self.is_extent_due, self.n_hinted) = (false, 0);
-        (self.step, self.step_millis) = (0, 0.0);
+        let compiled = self.compiled.take();
+        *self = Self { compiled, ..Self::new(self.gpu.clone(), self.options.clone())? };
         Ok(())
+    }
+
+    fn learned_fix(&mut self, camera: &str) -> Result<Option<CameraFix>, Error> {
+        Ok(self.camera_fixes()?.get(camera).cloned())
     }
 }
 
@@ -194,16 +234,28 @@ impl Method for NerfModel {
             return Ok(());
         }
         keyframe.check()?;
-        self.images.push(RayImage::new(keyframe));
-        self.is_extent_due = true;
+        let is_held_back = keyframe.split == Split::Selection && !self.trial.is_over();
+        let image = RayImage::new(keyframe);
+        if is_held_back {
+            self.held_back.push(image);
+        } else {
+            self.images.push(image);
+            self.is_extent_due = true;
+        }
         Ok(())
     }
 
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
         let is_meant = |image: &RayImage| image.keyframe.camera.as_ref() == camera && image.keyframe.stamp == stamp;
+        self.held_back.retain(|image| !is_meant(image));
         if let Some(ix) = self.images.iter().position(is_meant) {
+            self.settle()?;
             self.images.remove(ix);
             self.n_hinted -= usize::from(ix < self.n_hinted);
+            self.fixes = None;
+            if let Some((_, learner)) = &mut self.field {
+                learner.forget_pose(&self.gpu, ix)?;
+            }
         }
         Ok(())
     }
@@ -213,7 +265,8 @@ impl Method for NerfModel {
             self.settle()?;
             return Ok(0);
         }
-        let n_steps = n.min(self.steps_per_submit());
+        self.try_when_due()?;
+        let n_steps = n.min(self.steps_per_submit()).min(self.steps_to_trial());
         let since = Instant::now();
         for slot_ix in 0..n_steps {
             self.record(usize::try_from(slot_ix).expect("few steps"))?;
@@ -238,7 +291,7 @@ impl Method for NerfModel {
 
     fn n_taken(&mut self) -> Result<u64, Error> {
         self.settle()?;
-        Ok(self.step)
+        Ok(self.step + self.n_taken_back)
     }
 
     /// Nothing can be drawn before something was learned.
@@ -257,7 +310,9 @@ impl Method for NerfModel {
     }
 
     fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {
-        Ok(PosedLens::of(keyframe))
+        let fixes = self.camera_fixes()?;
+        let fix = fixes.get(keyframe.camera.as_ref());
+        Ok(fix.map_or_else(|| PosedLens::of(keyframe), |fix| fix.apply(keyframe)))
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
@@ -285,7 +340,7 @@ impl Method for NerfModel {
     }
 
     fn report(&self) -> Vec<Part> {
-        Vec::new()
+        self.part.iter().cloned().collect()
     }
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {

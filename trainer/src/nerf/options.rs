@@ -1,5 +1,6 @@
 //! How a neural field learns.
 
+use crate::splat::CameraChoice;
 use serde::{Deserialize, Serialize};
 
 /// Settings of a [`super::NerfModel`].
@@ -22,6 +23,8 @@ pub struct NerfOptions {
     pub rate: f64,
     /// What is left of it at the end of the planned steps.
     pub final_rate_frac: f64,
+    /// What is learned about cameras with the field: of all terms it knows the poses of images.
+    pub cameras: CameraChoice,
     /// Sizes of batch and networks; `None`: as suits the adapter.
     pub effort: Option<Effort>,
 }
@@ -73,6 +76,17 @@ impl Effort {
     };
 }
 
+impl Effort {
+    /// With cells and steps half as wide, where these are those of a GPU: a processor would wait for them.
+    #[must_use]
+    pub(crate) fn finer(self) -> Self {
+        if self.n_cells < Self::FULL.n_cells {
+            return self;
+        }
+        Self { n_cells: 2 * self.n_cells, n_steps: 2 * self.n_steps, ..self }
+    }
+}
+
 impl Default for NerfOptions {
     fn default() -> Self {
         Self {
@@ -84,6 +98,7 @@ impl Default for NerfOptions {
             distortion: 0.01,
             rate: 2e-2,
             final_rate_frac: 0.03,
+            cameras: CameraChoice::default(),
             effort: None,
         }
     }

@@ -124,6 +124,22 @@ pub(crate) struct Pace {
     pub(crate) correction: [f32; 2],
 }
 
+/// `PoseRule` of `learn_poses.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct PoseRule {
+    pub(crate) turn_rate: f32,
+    pub(crate) shift_rate: f32,
+    pub(crate) pull: f32,
+    pub(crate) n_images: u32,
+}
+
+/// What is kept of each image, [`TERM_STRIDE`] terms of which the first [`TERMS`] are its turn and its shift, as in
+/// `shared/image_terms.wgsl`: value, Adam's two means, and the steps it took.
+pub(crate) type Term = [f32; 4];
+pub(crate) const TERMS: usize = 6;
+pub(crate) const TERM_STRIDE: usize = 8;
+
 impl LearnRule {
     /// Of the first step.
     pub(crate) fn first_pace(&self) -> Pace {

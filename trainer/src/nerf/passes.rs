@@ -1,7 +1,8 @@
 //! The stages of drawing and learning, as lists of passes.
 
 use super::buffers::{
-    FieldBuffers, FieldMoments, FieldSlopes, N_SHARES, Occupancy, RaySlot, SampleBuffers, StepBuffers, n_blocks,
+    FieldBuffers, FieldMoments, FieldSlopes, N_SHARES, Occupancy, PoseBuffers, RaySlot, SampleBuffers, StepBuffers,
+    n_blocks,
 };
 use super::kernels::{CHUNK_TILES, FieldPipelines, N_TILE};
 use super::params::Backdrop;
@@ -201,13 +202,45 @@ impl FieldPasses<'_> {
         list.dispatch(gpu, &pipelines.show_rays, groups(slot.n_rays, 64), &shown);
     }
 
-    /// After [`FieldPasses::forward`]: the loss of every ray, and the slopes towards all that is learned.
-    pub(crate) fn backward(&self, list: &mut Passes, step: &StepBuffers, slopes: &FieldSlopes) {
+    /// Moves the rays as their images' poses were found to be moved.
+    pub(crate) fn aim(&self, list: &mut Passes, poses: &PoseBuffers) {
+        let Self { gpu, pipelines, samples, slot, .. } = *self;
+        let aimed = [("batch", &samples.batch), ("terms", &poses.terms), ("rays", &slot.rays)];
+        list.dispatch(gpu, &pipelines.aim_rays, groups(slot.n_rays, 64), &aimed);
+    }
+
+    /// After [`FieldPasses::backward`]: one step of the poses of all images.
+    pub(crate) fn learn_poses(
+        &self,
+        list: &mut Passes,
+        step: &StepBuffers,
+        moments: &FieldMoments,
+        poses: &PoseBuffers,
+    ) {
         let Self { gpu, pipelines, field, samples, slot } = *self;
-        let batch = ("batch", &samples.batch);
-        let (v_log_density, v_colors) = (("v_log_density", &step.v_log_density), ("v_colors", &step.v_colors));
-        let composited = [
+        let (batch, rays, spans) = (("batch", &samples.batch), ("rays", &slot.rays), ("spans", &samples.spans));
+        let (v_points, v_rays) = (("v_points", &poses.v_points), ("v_rays", &poses.v_rays));
+        let looked_up = [
             batch,
+            ("levels", &field.levels),
+            ("points", &samples.points),
+            ("grid", &field.grid),
+            rays,
+            spans,
+            ("v_held", &step.v_held),
+            v_points,
+        ];
+        list.dispatch(gpu, &pipelines.point_slopes, groups(samples.n_samples, 64), &looked_up);
+        list.dispatch(gpu, &pipelines.ray_slopes, groups(slot.n_rays, 64), &[batch, rays, spans, v_points, v_rays]);
+        let learned = [batch, ("rule", &poses.rule), ("pace", &moments.pace), rays, v_rays, ("terms", &poses.terms)];
+        list.dispatch(gpu, &pipelines.learn_poses, poses.n_images.into(), &learned);
+    }
+
+    /// After [`FieldPasses::forward`]: what every ray sees, its loss, and the slopes back to its samples.
+    pub(crate) fn composite(&self, list: &mut Passes, step: &StepBuffers) {
+        let Self { gpu, pipelines, samples, slot, .. } = *self;
+        let composited = [
+            ("batch", &samples.batch),
             ("loss", &slot.loss),
             ("rays", &slot.rays),
             ("spans", &samples.spans),
@@ -215,10 +248,18 @@ impl FieldPasses<'_> {
             ("colors", &samples.colors),
             ("seen", &step.seen),
             ("ray_errors", &step.ray_errors),
-            v_log_density,
-            v_colors,
+            ("v_log_density", &step.v_log_density),
+            ("v_colors", &step.v_colors),
         ];
         list.dispatch(gpu, &pipelines.composite, groups(slot.n_rays, 64), &composited);
+    }
+
+    /// After [`FieldPasses::forward`]: the loss of every ray, and the slopes towards all that is learned.
+    pub(crate) fn backward(&self, list: &mut Passes, step: &StepBuffers, slopes: &FieldSlopes) {
+        let Self { gpu, pipelines, field, samples, .. } = *self;
+        self.composite(list, step);
+        let batch = ("batch", &samples.batch);
+        let (v_log_density, v_colors) = (("v_log_density", &step.v_log_density), ("v_colors", &step.v_colors));
         let (held, v_held) = (("held", &step.held), ("v_held", &step.v_held));
         let carried = [
             batch,

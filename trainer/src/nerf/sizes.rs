@@ -3,7 +3,7 @@
 use super::extent::{Extent, pixel_size_m};
 use super::options::{Effort, NerfOptions};
 use super::reference::grid::GridShape;
-use crate::{Error, Keyframe};
+use crate::{DepthMap, Error, Keyframe};
 use serde::{Deserialize, Serialize};
 
 /// Cells of the coarsest level along an axis.
@@ -35,6 +35,18 @@ pub(crate) struct Sizes {
     pub(crate) effort: Effort,
 }
 
+/// Whether most images have depth for most of what they show: then it is known from the start which cells are empty, and finer ones cost little.
+fn is_dense<'a>(keyframes: impl Iterator<Item = &'a Keyframe>) -> bool {
+    /// Every so manieth reading is looked at.
+    const STRIDE: usize = 61;
+    let is_known = |depth: &DepthMap| {
+        let readings = depth.depth_m.iter().step_by(STRIDE);
+        2 * readings.clone().filter(|z| **z > 0.0).count() > readings.count()
+    };
+    let known: Vec<bool> = keyframes.map(|keyframe| keyframe.depth.as_ref().is_some_and(is_known)).collect();
+    2 * known.iter().filter(|is_known| **is_known).count() > known.len()
+}
+
 impl Sizes {
     /// Levels down to what a pixel sees, and entries for what an image shows, as far as limits allow.
     pub(crate) fn choose<'a>(
@@ -53,6 +65,7 @@ impl Sizes {
         let n_levels =
             n_levels.next_multiple_of(2).clamp(LEAST_LEVELS, effort.most_levels.clamp(LEAST_LEVELS, MOST_LEVELS));
         let has_depth = keyframes.clone().any(|keyframe| keyframe.depth.is_some());
+        let effort = if is_dense(keyframes.clone()) { effort.finer() } else { effort };
         let n_pixels = keyframes.map(|keyframe| keyframe.rgba_srgb.len() / 4).max().unwrap_or(0);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a logarithm")]
         let wanted = (n_pixels.max(1) as f64 / PIXELS_PER_ENTRY).log2().ceil() as u32;

@@ -2,12 +2,14 @@
 //
 // threads   one per 32 cells
 // reads     thickness
-// writes    thickness_sum (2^-10 each; at most 1 a cell)
+// writes    thickness_sum (at most 1 a cell, in units that leave room for all: `mark_cells` knows them)
 
 #import folded
 
 @group(0) @binding(0) var<storage, read> thickness: array<f32>;
 @group(0) @binding(1) var<storage, read_write> thickness_sum: array<atomic<u32>>;
+
+const MOST_SUM = 4294967040.0; // The largest f32 that is a u32.
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
@@ -15,5 +17,5 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     if 32u * word >= arrayLength(&thickness) { return; }
     var sum = 0.0;
     for (var bit = 0u; bit < 32u; bit++) { sum += clamp(thickness[32u * word + bit], 0.0, 1.0); }
-    atomicAdd(&thickness_sum[0], u32(1024.0 * sum));
+    atomicAdd(&thickness_sum[0], u32(sum * MOST_SUM / f32(arrayLength(&thickness))));
 }

@@ -9,6 +9,7 @@ use super::sizes::Sizes;
 use super::{NerfModel, params};
 use crate::eval::{self, PixelPair};
 use crate::gpu::{Gpu, GpuOptions};
+use crate::splat::{CameraChoice, TermSet, moved};
 use crate::test_scenes as scenes;
 use crate::{Aabb, DepthMap, Error, Keyframe, Method, Picture, Projection, RenderRequest, Split};
 use kinematics::{Transform, Twist};
@@ -191,6 +192,65 @@ fn a_crop_a_range_and_all_directions_are_drawn() {
     };
     let picture = model.render(&all).unwrap();
     assert_eq!((picture.size_px, picture.depth_m.len()), ([64, 32], 64 * 32));
+}
+
+/// Poses that drift from image to image are found along with the scene, where a trial says that it pays; stopping in its midst
+/// changes nothing.
+#[test]
+fn poses_that_drift_are_found() {
+    let right = ball_on_floor(24);
+    let drifted = |keyframe: &Arc<Keyframe>| {
+        let phase = 0.35 * keyframe.stamp.0 as f64;
+        let turn_rad = Vector3::new(0.02 * phase.sin(), 0.02 * phase.cos(), 0.0);
+        let shift_m = Vector3::new(0.0, 0.01, -0.015) * phase.cos();
+        let off = moved(turn_rad, shift_m);
+        let depth = keyframe
+            .depth
+            .as_ref()
+            .map(|depth| DepthMap { world_from_camera: depth.world_from_camera * off, ..depth.clone() });
+        let split = if keyframe.stamp.0 % 4 == 2 { Split::Selection } else { Split::Train };
+        Arc::new(Keyframe { world_from_camera: keyframe.world_from_camera * off, depth, split, ..(**keyframe).clone() })
+    };
+    let wrong: Vec<Arc<Keyframe>> = right.iter().map(drifted).collect();
+    let off_m = |found: &Transform, right: &Keyframe| {
+        // Where a point half a metre ahead is seen.
+        let ahead = Point3::new(0.0, 0.0, 0.5);
+        (found * ahead - right.world_from_camera * ahead).norm()
+    };
+    let mean_off_m = |model: &mut NerfModel, given: &[Arc<Keyframe>]| {
+        let off = given
+            .iter()
+            .zip(&right)
+            .map(|(given, right)| off_m(&model.posed_lens(given).unwrap().world_from_camera, right));
+        off.sum::<f64>() / given.len() as f64
+    };
+    let poses = TermSet { image_poses: true, ..TermSet::NONE };
+    let options = |cameras| NerfOptions { cameras, n_planned_steps: 600, ..options() };
+    let mut model = started(options(CameraChoice::Try(vec![poses])), &wrong);
+    let before_m = mean_off_m(&mut model, &wrong);
+    learn(&mut model, 90); // In the midst of the trial.
+    let checkpoint = state(&mut model);
+    learn(&mut model, 600);
+    let after_m = mean_off_m(&mut model, &wrong);
+    assert!(model.report()[0].kept, "{:?}", model.report());
+    // A few hundred small steps, and where all images are moved together nobody can tell: 15 mm became 9.
+    assert!(after_m < 0.75 * before_m, "{before_m} m, then {after_m} m");
+
+    let (mut resumed, rest) = NerfModel::resume(gpu(), &checkpoint, &wrong).unwrap();
+    assert_eq!(rest.len(), 6, "images held back come back");
+    rest.into_iter().for_each(|keyframe| resumed.push(keyframe).unwrap());
+    learn(&mut resumed, 600);
+    assert!(state(&mut model).arrays == state(&mut resumed).arrays, "the trial begins again, and ends the same");
+
+    let folder = tempfile::tempdir().unwrap();
+    model.save(folder.path()).unwrap();
+    let mut loaded = NerfModel::load(gpu(), folder.path()).unwrap();
+    assert_eq!(loaded.posed_lens(&wrong[3]).unwrap(), model.posed_lens(&wrong[3]).unwrap());
+
+    // Images of which none is held back cannot decide.
+    let mut unjudged = started(options(CameraChoice::Try(vec![poses])), &right);
+    learn(&mut unjudged, 120);
+    assert!(unjudged.report().is_empty() && mean_off_m(&mut unjudged, &right) == 0.0);
 }
 
 /// Numbers that no camera should send change nothing that they do not have to.

@@ -35,9 +35,10 @@ fn hidden_1_row() -> u32 { return N_FEATURES + N_HIDDEN + N_COLOR_IN; }
 fn hidden_2_row() -> u32 { return N_FEATURES + 2u * N_HIDDEN + N_COLOR_IN; }
 fn n_held_rows() -> u32 { return N_FEATURES + 3u * N_HIDDEN + N_COLOR_IN; }
 
-// Rows of slopes: towards the hidden layer of the first network, what it tells, both hidden layers of the second, and colors.
+// Rows of slopes: towards the hidden layer of the first network, what it tells, both hidden layers of the second, colors, and features.
 fn v_told_row() -> u32 { return N_HIDDEN; }
 fn v_hidden_1_row() -> u32 { return N_HIDDEN + N_TOLD; }
 fn v_hidden_2_row() -> u32 { return 2u * N_HIDDEN + N_TOLD; }
 fn v_color_row() -> u32 { return 3u * N_HIDDEN + N_TOLD; }
-fn n_slope_rows() -> u32 { return 3u * N_HIDDEN + N_TOLD + N_COLORS; }
+fn v_features_row() -> u32 { return 3u * N_HIDDEN + N_TOLD + N_COLORS; }
+fn n_slope_rows() -> u32 { return 3u * N_HIDDEN + N_TOLD + N_COLORS + N_FEATURES; }

@@ -954,7 +954,7 @@ fn is_bare(keyframe: &Keyframe) -> bool {
 #[derive(Default, serde::Deserialize)]
 #[serde(default)]
 pub(crate) struct About {
-    cameras: BTreeMap<String, CameraFix>,
+    pub(crate) cameras: BTreeMap<String, CameraFix>,
     pub(crate) alignment: Option<Alignment>,
 }
 

@@ -1,20 +1,25 @@
 //! The state of a field on the way, and a field in a folder.
 
 use super::NerfModel;
+use super::poses::{Saved, Trial};
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::gpu::{Buffer, Gpu, PendingRead};
 use crate::nerf::extent::Extent;
 use crate::nerf::learner::Learner;
 use crate::nerf::options::NerfOptions;
+use crate::nerf::params::{TERM_STRIDE, Term};
 use crate::nerf::rays::RayImage;
 use crate::nerf::sizes::Sizes;
 use crate::seen::{self, Seen};
-use crate::{Error, Keyframe, Method};
+use crate::splat::read_about;
+use crate::{Error, Keyframe, Method, Part};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::sync::Arc;
 
 const METHOD: &str = "nerf";
+/// What is learned of images.
+const TERMS: &str = "terms";
 /// The field: a checkpoint of what pictures need.
 const FIELD: &str = "field.nerf";
 
@@ -29,6 +34,21 @@ struct State {
     n_hinted: usize,
     /// Where there is a field.
     field: Option<(Extent, Sizes)>,
+    #[serde(default)]
+    learns_poses: bool,
+    #[serde(default)]
+    is_trial_over: bool,
+    #[serde(default)]
+    part: Option<Part>,
+    #[serde(default)]
+    n_taken_back: u64,
+    /// How many images the poses that are learned have room for.
+    #[serde(default)]
+    n_poses: Option<u32>,
+}
+
+fn written(state: &State) -> Result<serde_json::Value, Error> {
+    serde_json::to_value(state).map_err(|error| bad_state(error.to_string()))
 }
 
 fn bad_state(reason: String) -> Error {
@@ -58,6 +78,7 @@ impl Learner {
             ]
             .map(|(name, buffer)| (name.to_owned(), buffer)),
         );
+        all.extend(self.poses.iter().map(|poses| (TERMS.to_owned(), &poses.terms)));
         all
     }
 }
@@ -80,21 +101,58 @@ impl NerfModel {
         folder.join(FIELD).is_file()
     }
 
-    fn state(&self) -> Result<serde_json::Value, Error> {
-        let state = State {
+    fn state(&self) -> Result<State, Error> {
+        Ok(State {
             options: NerfOptions { effort: Some(self.effort()), ..self.options.clone() },
             step: self.step,
             images: self.images.iter().map(|image| Seen::of(&image.keyframe)).collect(),
             is_extent_due: self.is_extent_due,
             n_hinted: self.n_hinted,
             field: self.field.as_ref().map(|(extent, learner)| (*extent, learner.sizes.clone())),
-        };
-        serde_json::to_value(state).map_err(|error| bad_state(error.to_string()))
+            learns_poses: self.learns_poses,
+            is_trial_over: self.trial.is_over(),
+            part: self.part.clone(),
+            n_taken_back: self.n_taken_back,
+            n_poses: self.field.as_ref().and_then(|(_, learner)| Some(learner.poses.as_ref()?.n_images)),
+        })
     }
 
+    /// The field as it is; what was sent must be done.
+    pub(super) fn saved(&self) -> Result<Saved, Error> {
+        let reads = self.field.as_ref().map_or(Vec::new(), |(_, learner)| begin_read(&self.gpu, learner.learned()));
+        Ok(Saved { arrays: finish(&self.gpu, reads)?, step: self.step })
+    }
+
+    /// Makes the field what it was; what was sent must be done.
+    pub(super) fn put_back(&mut self, saved: &Saved) -> Result<(), Error> {
+        self.step = saved.step;
+        self.fixes = None;
+        let Some((_, learner)) = &mut self.field else { return Ok(()) };
+        let terms = saved.arrays.iter().find(|array| array.name == TERMS);
+        match terms {
+            Some(terms) => learner.hold_poses(&self.gpu, terms.bytes.len() / (TERM_STRIDE * size_of::<Term>()))?,
+            None => learner.forget_poses(),
+        }
+        for (name, buffer) in learner.learned() {
+            if let Some(array) = saved.arrays.iter().find(|array| array.name == name) {
+                self.gpu.write(buffer, 0, &array.bytes);
+            }
+        }
+        Ok(())
+    }
+
+    /// In the midst of a trial the state from before it, with which the trial begins again.
     pub(super) fn take_checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         self.settle()?;
-        let (gpu, state) = (self.gpu.clone(), self.state()?);
+        let (gpu, mut state) = (self.gpu.clone(), self.state()?);
+        if let Trial::With { before } | Trial::Without { before, .. } = &self.trial {
+            (state.step, state.learns_poses, state.n_poses) = (before.step, false, None);
+            let (state, arrays) = (written(&state)?, before.arrays.clone());
+            return Ok(PendingCheckpoint::new(move || {
+                Ok(Checkpoint { method: METHOD.to_owned(), seconds: 0.0, state, arrays })
+            }));
+        }
+        let state = written(&state)?;
         let reads = self.field.as_ref().map_or(Vec::new(), |(_, learner)| begin_read(&gpu, learner.learned()));
         Ok(PendingCheckpoint::new(move || {
             Ok(Checkpoint { method: METHOD.to_owned(), seconds: 0.0, state, arrays: finish(&gpu, reads)? })
@@ -116,13 +174,22 @@ impl NerfModel {
         if let Some((extent, sizes)) = &state.field {
             sizes.check()?;
             let compiled = model.compiled()?;
-            let learner = Learner::new(&model.gpu, &model.options, sizes.clone(), compiled)?;
+            let mut learner = Learner::new(&model.gpu, &model.options, sizes.clone(), compiled)?;
+            if let Some(n_poses) = state.n_poses {
+                learner.hold_poses(&model.gpu, n_poses as usize)?;
+            }
             for (name, buffer) in buffers(&learner) {
                 model.gpu.write(buffer, 0, checkpoint.array(&name, buffer.bytes())?);
             }
             model.field = Some((*extent, learner));
         }
         model.step = state.step;
+        model.n_taken_back = state.n_taken_back;
+        model.learns_poses = state.learns_poses;
+        model.part.clone_from(&state.part);
+        if state.is_trial_over {
+            model.trial = Trial::Over;
+        }
         Ok((model, state))
     }
 
@@ -144,7 +211,9 @@ impl NerfModel {
     /// A saved field, to be drawn.
     pub fn load(gpu: Arc<Gpu>, folder: &Path) -> Result<Self, Error> {
         let checkpoint = Checkpoint::read(&folder.join(FIELD))?;
-        Ok(Self::of_state(gpu, &checkpoint, Learner::drawn)?.0)
+        let mut model = Self::of_state(gpu, &checkpoint, Learner::drawn)?.0;
+        model.loaded_fixes = read_about(&folder.join("model.json"))?.cameras;
+        Ok(model)
     }
 
     pub(super) fn write_folder(&mut self, folder: &Path) -> Result<(), Error> {
@@ -152,7 +221,8 @@ impl NerfModel {
         let refused = |path: &Path, source| Error::Write { path: path.to_owned(), source };
         std::fs::create_dir_all(folder).map_err(|source| refused(folder, source))?;
         let reads = self.field.as_ref().map_or(Vec::new(), |(_, learner)| begin_read(&self.gpu, learner.drawn()));
-        let (state, arrays) = (self.state()?, finish(&self.gpu, reads)?);
+        let (state, arrays) = (written(&self.state()?)?, finish(&self.gpu, reads)?);
+        let cameras = self.camera_fixes()?.clone();
         Checkpoint { method: METHOD.to_owned(), seconds: 0.0, state, arrays }.write(&folder.join(FIELD))?;
         let sizes = self.field.as_ref().map(|(_, learner)| &learner.sizes);
         let about = serde_json::json!({
@@ -161,6 +231,7 @@ impl NerfModel {
             "entries": self.progress().primitives,
             "levels": sizes.map(|sizes| &sizes.n_cells),
             "extent": self.extent(),
+            "cameras": cameras,
         });
         let path = folder.join("model.json");
         std::fs::write(&path, format!("{about:#}\n")).map_err(|source| refused(&path, source))

@@ -2,7 +2,7 @@
 //!
 //! A point is contracted into the unit cube (`space`), looked up in a hash grid (`grid`), and two networks (`network`) turn
 //! what is found there into density and color (`field`). Samples along a ray are composited, and the loss of a ray is taken
-//! and carried back (`ray`).
+//! and carried back (`ray`), to the pose of its image too (`pose`).
 //!
 //! Source: Mueller et al. 2022 (Instant NGP); Barron et al. 2022 (Mip-NeRF 360, contraction and distortion); Tancik et al.
 //! 2023 (Nerfstudio, appearance codes).
@@ -11,6 +11,7 @@ pub mod field;
 pub mod grid;
 pub mod march;
 pub mod network;
+pub mod pose;
 pub mod ray;
 pub mod space;
 

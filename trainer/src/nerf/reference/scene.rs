@@ -73,33 +73,41 @@ fn place(ray: &Ray, span: [f64; 2]) -> [f64; 3] {
 }
 
 pub(crate) fn samples(field: &Field, ray: &Ray) -> Vec<Sample> {
+    samples_seen_along(field, ray, ray.direction)
+}
+
+/// The samples of a ray as they look along another direction.
+fn samples_seen_along(field: &Field, ray: &Ray, direction: [f64; 3]) -> Vec<Sample> {
     let sample = |span: &[f64; 2]| {
-        let point = field.point(place(ray, *span), ray.direction, &ray.code);
+        let point = field.point(place(ray, *span), direction, &ray.code);
         Sample { span: *span, density: point.density, rgb: point.rgb }
     };
     ray.spans.iter().map(sample).collect()
 }
 
 pub(crate) fn loss(field: &Field, ray: &Ray) -> f64 {
-    let samples = samples(field, ray);
+    loss_seen_along(field, ray, ray.direction)
+}
+
+/// As [`loss`], with colors as they look along another direction.
+pub(crate) fn loss_seen_along(field: &Field, ray: &Ray, direction: [f64; 3]) -> f64 {
+    let samples = samples_seen_along(field, ray, direction);
     ray::loss(&samples, &ray::composite(&samples), &ray.target, &WEIGHTS).0
 }
 
-/// Gradient by the parameters, by the ray's origin, and by the image's code.
-pub(crate) fn gradient(field: &Field, ray: &Ray) -> (FieldGrad, [f64; 3], Vec<f64>) {
+/// Gradient by the parameters, by the places of the samples (with their distance along the ray), and by the image's code.
+pub(crate) fn gradient(field: &Field, ray: &Ray) -> (FieldGrad, Vec<(f64, [f64; 3])>, Vec<f64>) {
     let samples = samples(field, ray);
     let seen = ray::composite(&samples);
     let (_, upstream) = ray::loss(&samples, &seen, &ray.target, &WEIGHTS);
     let slopes = ray::composite_backward(&samples, &seen, &upstream);
-    let (mut gradient, mut v_origin, mut v_code) = (FieldGrad::zeros(field), [0.0; 3], vec![0.0; N_CODE]);
+    let (mut gradient, mut v_places, mut v_code) = (FieldGrad::zeros(field), Vec::new(), vec![0.0; N_CODE]);
     for (span, (v_density, v_rgb)) in ray.spans.iter().zip(slopes) {
         let at = place(ray, *span);
         let point = field.point(at, ray.direction, &ray.code);
         let (v_at, v_own) = field.point_backward(at, &point, v_density, v_rgb, &mut gradient);
-        for axis in 0..3 {
-            v_origin[axis] += v_at[axis];
-        }
+        v_places.push((0.5 * (span[0] + span[1]), v_at));
         v_code.iter_mut().zip(v_own).for_each(|(sum, v)| *sum += v);
     }
-    (gradient, v_origin, v_code)
+    (gradient, v_places, v_code)
 }

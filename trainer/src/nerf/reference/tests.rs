@@ -2,8 +2,9 @@
 
 use super::field::Field;
 use super::grid::{self, GridShape};
+use super::pose::ImagePose;
 use super::ray::{self, Sample};
-use super::scene::{N_CODE, Ray, field, gradient, loss, ray};
+use super::scene::{N_CODE, Ray, field, gradient, loss, loss_seen_along, ray};
 use super::space::{contract, contract_backward};
 use crate::mismatches::Mismatches;
 
@@ -19,7 +20,7 @@ fn gradients_of_a_ray_match_central_differences() {
     let mut wrong = Mismatches::default();
     for seed in [3, 4, 5] {
         let (field, ray) = (field(seed), ray(seed + 10));
-        let (slopes, v_origin, v_code) = gradient(&field, &ray);
+        let (slopes, v_places, v_code) = gradient(&field, &ray);
         let nudged = |change: &dyn Fn(&mut Field, f64), step: f64| {
             let mut field = field.clone();
             change(&mut field, step);
@@ -39,13 +40,18 @@ fn gradients_of_a_ray_match_central_differences() {
             let numeric = central(|step| nudged(&|field, step| field.color.weights[ix] += step, step));
             wrong.check(format!("{seed}: color {ix}"), *slope, numeric, ABS, REL);
         }
+        let pose = ImagePose::slopes(ray.direction, &v_places);
         for axis in 0..3 {
-            let moved = |step: f64| {
-                let mut origin = ray.origin;
-                origin[axis] += step;
-                loss(&field, &Ray { origin, spans: ray.spans.clone(), code: ray.code.clone(), ..ray })
+            let moved = |pose: ImagePose| {
+                let (origin, direction) = pose.aim(ray.origin, ray.direction);
+                let moved = Ray { origin, direction, spans: ray.spans.clone(), code: ray.code.clone(), ..ray };
+                loss_seen_along(&field, &moved, ray.direction)
             };
-            wrong.check(format!("{seed}: origin {axis}"), v_origin[axis], central(moved), ABS, REL);
+            let along = |step: f64| std::array::from_fn(|other| if other == axis { step } else { 0.0 });
+            let shifted = |step: f64| moved(ImagePose { shift: along(step), ..ImagePose::default() });
+            wrong.check(format!("{seed}: shift {axis}"), pose.shift[axis], central(shifted), ABS, REL);
+            let turned = |step: f64| moved(ImagePose { turn_rad: along(step), ..ImagePose::default() });
+            wrong.check(format!("{seed}: turn {axis}"), pose.turn_rad[axis], central(turned), ABS, REL);
         }
         for ix in 0..N_CODE {
             let moved = |step: f64| {
