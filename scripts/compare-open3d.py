@@ -7,7 +7,7 @@ usage: compare-open3d.py surfaces DATA MODEL OUT_FOLDER   (MODEL: the folder of 
 `surfaces` fuses, on the processor, the frames of a nerfstudio folder that MODEL/keyframes.txt says ours was fused from, with the
 same poses, lens, depth range, voxels and truncation (those of MODEL/model.json), and compares Open3D's mesh with MODEL/mesh.ply:
 - fusing: milliseconds a frame with color, the median after the first pass over all frames, images decoded before;
-- mesh: triangles, area, boundary edges (their number, length and loops), connected parts, after vertices closer than 10 um are
+- mesh (of all voxels seen; `mesh_as_usual`: of those seen more than three times, Open3D's default): triangles, area, boundary edges (their number, length and loops), connected parts, after vertices closer than 10 um are
   made one, as neither program promises that blocks share theirs;
 - against_depth: the depth images of test frames, which neither has fused, against the depth of the mesh there: share of measured
   pixels with a surface at all, and with one within two voxels (along z), and the median error;
@@ -208,12 +208,14 @@ def surfaces(args):
     voxel_m, depth_max_m = about["voxel_m"], about["max_depth_m"]
     truncation_voxels = about["truncation_m"] / voxel_m
     frames, test_frames = frames_of(args.data, args.model / "keyframes.txt")
-    grid = Grid(voxel_m, truncation_voxels, depth_max_m)
-    for frame in frames:
-        grid.fuse(frame)
-    theirs = grid.mesh(0.0)
-    told = {"open3d": {"version": o3d.__version__, "mesh": theirs.told(), "mesh_as_usual": grid.mesh(3.0).told()}}
-    told["open3d"]["fusing"] = timing([grid.fuse(frame) for frame in frames])  # Warm, with all blocks there.
+    told = {"open3d": {"version": o3d.__version__}}
+    for block in (8, 16):
+        grid = Grid(voxel_m, truncation_voxels, depth_max_m, block)
+        for frame in frames:
+            grid.fuse(frame)
+        theirs = grid.mesh(0.0)
+        told["open3d"]["mesh"], told["open3d"]["mesh_as_usual"] = theirs.told(), grid.mesh(3.0).told()
+        told["open3d"][f"fusing_blocks_of_{block}"] = timing([grid.fuse(frame) for frame in frames])  # Warm, with all blocks there.
     ours = Mesh.read(args.model / "mesh.ply")
     told["fieldrig"] = {"mesh": ours.told()}
     told["voxel_mm"], told["truncation_voxels"], told["frames"] = 1e3 * voxel_m, truncation_voxels, len(frames)
