@@ -37,26 +37,31 @@ impl UdpBase {
         let Self { receiver, order, counts } = self;
         let device = receiver.device();
         counts.n_received += 1;
-        counts.n_dropped += arrived.n_dropped;
+        tell(device, &mut counts.n_dropped, arrived.n_dropped, "poses gave way to newer ones");
         let datagram = match decode_pose(&arrived.bytes) {
             Ok(datagram) => datagram,
             Err(error) => {
-                tell(device, &mut counts.n_refused, format_args!("a datagram is refused: {error}"));
+                tell(device, &mut counts.n_refused, 1, format_args!("a datagram is refused: {error}"));
                 return None;
             }
         };
         match order.place(datagram.head.seq, arrived.at) {
-            Place::New { n_lost } => counts.n_lost += n_lost,
-            Place::Restart => tell(device, &mut counts.n_restarts, "the sender counts anew"),
+            Place::New { n_lost } => tell(device, &mut counts.n_lost, n_lost, "poses did not come"),
+            Place::Restart => tell(device, &mut counts.n_restarts, 1, "the sender counts anew"),
             Place::Newest | Place::Late => {
-                tell(device, &mut counts.n_late, "a pose came late or twice");
+                tell(device, &mut counts.n_late, 1, "a pose came late or twice");
                 return None;
             }
         }
         let stamp = order.stamp(&datagram.head, arrived.at);
         if stamp.is_none() {
             let says = datagram.head.stamp_nanos;
-            tell(device, &mut counts.n_refused, format_args!("the stamp {says} is not after the last, or not of now"));
+            tell(
+                device,
+                &mut counts.n_refused,
+                1,
+                format_args!("the stamp {says} is not after the last, or not of now"),
+            );
         }
         Some(BasePose { stamp: stamp?, world_from_base: datagram.world_from_base })
     }

@@ -19,10 +19,11 @@ pub struct Counts {
     pub n_restarts: u64,
 }
 
-/// Counts one more of a kind and logs it when the count is a power of two: soon at first, and never a flood.
-pub(super) fn tell(device: &str, n: &mut u64, what: impl fmt::Display) {
-    *n = n.saturating_add(1);
-    if n.is_power_of_two() {
+/// Counts `more` of a kind, and logs it where that doubles the count at least: soon at first, and never a flood.
+pub(super) fn tell(device: &str, n: &mut u64, more: u64, what: impl fmt::Display) {
+    let before = n.checked_ilog2();
+    *n = n.saturating_add(more);
+    if n.checked_ilog2() != before {
         log::warn!("{device}: {what} ({n} so far)");
     }
 }
@@ -37,5 +38,22 @@ impl Counts {
                  to newer ones; {n_lost} scans, poses or parts were lost; the sender began anew {n_restarts} times"
             );
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn counts_end_at_the_largest_number() {
+        let mut n = 0;
+        for _ in 0..1_000_000 {
+            tell("it", &mut n, 1, "comes");
+        }
+        tell("it", &mut n, 0, "does not");
+        assert_eq!(n, 1_000_000);
+        tell("it", &mut n, u64::MAX, "comes at once");
+        assert_eq!(n, u64::MAX);
     }
 }

@@ -58,7 +58,8 @@ impl UdpScanner {
 
     fn take(&mut self, arrived: &Arrived) {
         self.counts.n_received += 1;
-        self.counts.n_dropped += arrived.n_dropped;
+        let device = self.receiver.device();
+        tell(device, &mut self.counts.n_dropped, arrived.n_dropped, "datagrams gave way to newer ones");
         let part = match decode_scan(&arrived.bytes) {
             Ok(part) => part,
             Err(error) => return self.refuse(format_args!("{error}")),
@@ -68,15 +69,15 @@ impl UdpScanner {
         }
         match self.order.place(part.head.seq, arrived.at) {
             Place::New { n_lost } => {
-                self.counts.n_lost += n_lost;
+                tell(self.receiver.device(), &mut self.counts.n_lost, n_lost, "scans did not come");
                 self.begin(part, arrived.at);
             }
             Place::Restart => {
-                tell(self.receiver.device(), &mut self.counts.n_restarts, "the sender counts anew");
+                tell(self.receiver.device(), &mut self.counts.n_restarts, 1, "the sender counts anew");
                 self.begin(part, arrived.at);
             }
             Place::Newest => self.add(part),
-            Place::Late => tell(self.receiver.device(), &mut self.counts.n_late, "a part came late"),
+            Place::Late => tell(self.receiver.device(), &mut self.counts.n_late, 1, "a part came late"),
         }
     }
 
@@ -95,14 +96,14 @@ impl UdpScanner {
     fn add(&mut self, part: ScanPart) {
         let Some(turn) = &mut self.turn else {
             // Of a turn that is complete, or was refused.
-            return tell(self.receiver.device(), &mut self.counts.n_late, "a part came twice or late");
+            return tell(self.receiver.device(), &mut self.counts.n_late, 1, "a part came twice or late");
         };
         if turn.head != part.head || turn.parts.len() != part.n_parts as usize {
             return self.refuse(format_args!("it contradicts another part of the same scan"));
         }
         let place = &mut turn.parts[part.part as usize];
         if place.is_some() {
-            return tell(self.receiver.device(), &mut self.counts.n_late, "a part came twice");
+            return tell(self.receiver.device(), &mut self.counts.n_late, 1, "a part came twice");
         }
         *place = Some(part.points);
         if turn.parts.iter().all(Option::is_some) {
@@ -112,15 +113,14 @@ impl UdpScanner {
 
     fn end_turn(&mut self) {
         let Some(Turn { stamp, parts, .. }) = self.turn.take() else { return };
-        for _ in parts.iter().filter(|part| part.is_none()) {
-            tell(self.receiver.device(), &mut self.counts.n_lost, "a part of a scan did not come");
-        }
+        let n_missing = parts.iter().filter(|part| part.is_none()).count() as u64;
+        tell(self.receiver.device(), &mut self.counts.n_lost, n_missing, "parts of a scan did not come");
         let points: Arc<[RangePoint]> = parts.into_iter().flatten().flatten().collect();
         self.done.push_back(RangeScan { scanner: Arc::clone(&self.name), stamp, points });
     }
 
     fn refuse(&mut self, why: std::fmt::Arguments<'_>) {
-        tell(self.receiver.device(), &mut self.counts.n_refused, format_args!("a datagram is refused: {why}"));
+        tell(self.receiver.device(), &mut self.counts.n_refused, 1, format_args!("a datagram is refused: {why}"));
     }
 }
 

@@ -14,6 +14,8 @@ pub const MAX_PARTS: u32 = 64;
 const FAR_M: f64 = 1e4;
 /// Angles beyond this are slips, rad.
 const MOST_RAD: f64 = 100.0;
+/// Most characters of a parser's message that are told.
+const MAX_TOLD: usize = 200;
 /// How far from one the length of a quaternion may be.
 const UNIT_WITHIN: f64 = 1e-3;
 
@@ -272,7 +274,11 @@ fn check_kind(bytes: &[u8], wanted: &'static str) -> Result<(), Malformed> {
 }
 
 fn parsed<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, Malformed> {
-    serde_json::from_slice(bytes).map_err(|error| amiss(error.to_string()))
+    // The parser may repeat the sender's text, which may be long and hold anything: it goes into logs.
+    let told = |error: serde_json::Error| {
+        error.to_string().chars().take(MAX_TOLD).map(|c| if c.is_control() { '?' } else { c }).collect()
+    };
+    serde_json::from_slice(bytes).map_err(|error| amiss(told(error)))
 }
 
 fn amiss(reason: String) -> Malformed {
@@ -363,6 +369,14 @@ mod tests {
             let told = decode_pose(other.replace(from, to).as_bytes()).expect_err(to).to_string();
             assert!(told.contains(named), "{to}: {told}");
         }
+    }
+
+    #[test]
+    fn a_senders_text_does_not_flood_the_log() {
+        let long = format!(r#""a\n{}""#, "b".repeat(50_000));
+        let text = String::from_utf8(encode_pose(&pose())).expect("text").replace(r#""device""#, &long);
+        let told = decode_pose(text.as_bytes()).expect_err("no such clock").to_string();
+        assert!(told.contains("unknown variant `a?b") && told.len() <= MAX_TOLD, "{told}");
     }
 
     #[test]
