@@ -1,6 +1,7 @@
 //! What can go wrong with a device or a recording.
 
 use kinematics::Stamp;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -59,6 +60,24 @@ pub enum Error {
     Simulation {
         /// What the simulator says.
         reason: String,
+    },
+    /// The address of a device that sends over the network is not free, or not of this computer.
+    #[error("{device}: cannot listen on {address}")]
+    Listen {
+        /// Which device.
+        device: String,
+        /// The address.
+        address: SocketAddr,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// Nothing can be received any more.
+    #[error("{device}: the network broke off")]
+    Network {
+        /// Which device.
+        device: String,
+        /// Why.
+        source: std::io::Error,
     },
     /// A thread that reads a device cannot be started.
     #[error("cannot start the thread of {device}")]

@@ -1,11 +1,13 @@
 //! Devices, recordings and datasets behind a few traits; what comes out is stamped samples.
 
+pub mod clock;
 pub mod dataset;
 mod decode;
 mod error;
 mod live;
 pub mod recording;
 mod sample;
+pub mod udp;
 pub mod wire;
 
 pub use error::{Error, Kept};

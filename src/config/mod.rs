@@ -12,6 +12,7 @@ mod write;
 pub(crate) use error::ConfigError;
 
 use kinematics::{Intrinsics, Transform};
+use std::net::SocketAddr;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -68,6 +69,8 @@ pub(crate) enum ArmDriver {
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Base {
     pub(crate) driver: BaseDriver,
+    /// Where the driver `udp` listens.
+    pub(crate) address: SocketAddr,
     pub(crate) world_from_base: Transform,
     /// Poses a second where the base moves.
     pub(crate) rate_hz: f64,
@@ -90,6 +93,8 @@ pub(crate) enum BaseDriver {
 pub(crate) struct Scanner {
     pub(crate) name: Arc<str>,
     pub(crate) driver: ScannerDriver,
+    /// Where the driver `udp` listens.
+    pub(crate) address: SocketAddr,
     /// Turns a second.
     pub(crate) rate_hz: f64,
     /// Pose on the base: x ahead, z up.

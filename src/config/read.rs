@@ -7,6 +7,7 @@ use super::{
 };
 use kinematics::{Chain, Intrinsics, Lens, Transform};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use toml::{Table, Value};
 
 pub(super) const ARM_DRIVERS: [(&str, ArmDriver); 4] =
@@ -29,6 +30,9 @@ pub(super) const SCANNER_DRIVERS: [(&str, ScannerDriver); 2] =
 pub(super) const PARENTS: [(&str, Parent); 3] =
     [("flange", Parent::Flange), ("base", Parent::Base), ("world", Parent::World)];
 const METHODS: [(&str, &str); 3] = [("splat", "splat"), ("nerf", "nerf"), ("tsdf", "tsdf")];
+/// Where base poses and range scans are listened for where nothing says otherwise: of this computer only.
+const USUAL_BASE_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7009);
+const USUAL_SCANNER_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7010);
 /// Poses and lens coefficients beyond this are slips of the pen.
 const FAR: f64 = 1e4;
 /// Offsets of joints beyond this, rad or m, are not offsets.
@@ -142,6 +146,7 @@ fn base(mut keys: Section<'_>) -> Base {
     flaws.end();
     let base = Base {
         driver: keys.choice("driver", &BASE_DRIVERS).unwrap_or(BaseDriver::Fixed),
+        address: keys.address("address").unwrap_or(USUAL_BASE_ADDRESS),
         world_from_base: pose(&mut keys, "world_from_base").unwrap_or_else(Transform::identity),
         rate_hz: keys.number("rate_hz", 1.0..=1000.0).unwrap_or(100.0),
         drift_m: drift_m.unwrap_or(0.02),
@@ -172,6 +177,7 @@ fn scanner(name: &str, mut keys: Section<'_>) -> Scanner {
     let scanner = Scanner {
         name: name.into(),
         driver: driver.unwrap_or(ScannerDriver::Sim),
+        address: keys.address("address").unwrap_or(USUAL_SCANNER_ADDRESS),
         rate_hz: keys.number("rate_hz", 0.1..=50.0).unwrap_or(10.0),
         base_from_scanner: pose(&mut keys, "base_from_scanner").unwrap_or_else(Transform::identity),
         min_m,

@@ -5,6 +5,7 @@
 use super::error::{ConfigError, Place};
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
+use std::net::SocketAddr;
 use std::ops::RangeInclusive;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
@@ -186,6 +187,13 @@ impl<'a> Section<'a> {
             Value::String(text) => Some(text),
             other => self.wrong(key, &other, "text in quotes"),
         }
+    }
+
+    /// An IP address with a port, if the key is there.
+    pub(super) fn address(&mut self, key: &'static str) -> Option<SocketAddr> {
+        let text = self.text(key)?;
+        let allowed = "an IP address and a port in quotes, like \"127.0.0.1:7010\"";
+        text.parse().ok().or_else(|| self.wrong(key, &Value::String(text), allowed))
     }
 
     /// A list of texts, if the key is there.

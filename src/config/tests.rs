@@ -49,7 +49,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a good value that differs from the one in force, and a value that is not allowed.
-const KEYS: [(&str, &str, &str); 103] = [
+const KEYS: [(&str, &str, &str); 105] = [
     ("arm.driver", "'franka'", "'frankka'"),
     ("arm.address", "'172.16.0.2'", "7"),
     ("arm.urdf", "'other.urdf'", "7"),
@@ -59,12 +59,14 @@ const KEYS: [(&str, &str, &str); 103] = [
     ("arm.flange_link", "'tool'", "'nowhere'"),
     ("arm.max_speed_rad_s", "0.25", "-1"),
     ("base.driver", "'tags'", "'floating'"),
+    ("base.address", "'0.0.0.0:7009'", "'localhost'"),
     ("base.world_from_base.xyz_m", "[1, 0, 0]", "[1, 0]"),
     ("base.world_from_base.quat_xyzw", "[1, 0, 0, 0]", "[1, 1, 0, 0]"),
     ("base.rate_hz", "50", "0"),
     ("base.sim.drift_m", "0.1", "-0.1"),
     ("base.sim.drift_rad", "0.05", "2"),
     ("range.lidar.driver", "'sim'", "'laser'"),
+    ("range.lidar.address", "'[::1]:0'", "7010"),
     ("range.lidar.rate_hz", "5", "0"),
     ("range.lidar.base_from_scanner.xyz_m", "[0, 0, 0.2]", "[0, 0]"),
     ("range.lidar.base_from_scanner.quat_xyzw", "[0, 1, 0, 0]", "[0, 0, 0, 0]"),

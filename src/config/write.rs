@@ -57,6 +57,7 @@ fn base(base: &Base) -> Table {
     let sim = table([("drift_m", is(base.drift_m)), ("drift_rad", is(base.drift_rad))]);
     table([
         ("driver", name_of(&BASE_DRIVERS, &base.driver)),
+        ("address", is(base.address.to_string())),
         ("world_from_base", pose(&base.world_from_base)),
         ("rate_hz", is(base.rate_hz)),
         ("sim", Some(Value::Table(sim))),
@@ -74,6 +75,7 @@ fn scanner(scanner: &Scanner) -> Table {
     ]);
     table([
         ("driver", name_of(&SCANNER_DRIVERS, &scanner.driver)),
+        ("address", is(scanner.address.to_string())),
         ("rate_hz", is(scanner.rate_hz)),
         ("base_from_scanner", pose(&scanner.base_from_scanner)),
         ("min_m", is(scanner.min_m)),

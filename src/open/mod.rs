@@ -1,5 +1,6 @@
 //! Opens what a rig file or a recording names, as one source of samples.
 
+mod real;
 #[cfg(feature = "sim")]
 mod simulated;
 #[cfg(all(test, feature = "sim"))]
@@ -46,7 +47,7 @@ pub(crate) fn rig(mut rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
     if let Some(device) = absent_device(&rig) {
         bail!("{device} cannot be opened by this version; --sim replaces every device by its simulated twin");
     }
-    let source = simulate(&rig)?;
+    let source = simulate(&rig, real::open(&rig)?)?;
     Ok(Opened { rig, source, damage: Arc::default() })
 }
 
@@ -102,19 +103,16 @@ fn absent_device(rig: &Rig) -> Option<String> {
     if rig.arm.driver != ArmDriver::Sim {
         return Some(format!("arm driver {:?}", format!("{:?}", rig.arm.driver).to_lowercase()));
     }
-    if !matches!(rig.base.driver, BaseDriver::Fixed | BaseDriver::Sim) {
+    if matches!(rig.base.driver, BaseDriver::Tags | BaseDriver::Rgbd) {
         return Some(format!("base driver {:?}", format!("{:?}", rig.base.driver).to_lowercase()));
-    }
-    if let Some(scanner) = rig.scanners.iter().find(|scanner| scanner.driver != ScannerDriver::Sim) {
-        return Some(format!("range scanner {:?} with driver {:?}", scanner.name, "udp"));
     }
     let camera = rig.cameras.iter().find(|camera| camera.driver != CameraDriver::Sim)?;
     Some(format!("camera {:?} with driver {:?}", camera.name, format!("{:?}", camera.driver).to_lowercase()))
 }
 
 #[cfg(feature = "sim")]
-fn simulate(rig: &Rig) -> anyhow::Result<Box<dyn Source>> {
-    simulated::open(rig)
+fn simulate(rig: &Rig, real: drivers::Devices) -> anyhow::Result<Box<dyn Source>> {
+    simulated::open(rig, real)
 }
 
 #[cfg(feature = "sim")]
@@ -128,7 +126,7 @@ fn base_moves(_scene: &str) -> bool {
 }
 
 #[cfg(not(feature = "sim"))]
-fn simulate(_rig: &Rig) -> anyhow::Result<Box<dyn Source>> {
+fn simulate(_rig: &Rig, _real: drivers::Devices) -> anyhow::Result<Box<dyn Source>> {
     bail!("this program was built without the simulator: build it with `cargo build --release --features sim`")
 }
 

@@ -1,26 +1,36 @@
 //! A rig's simulated twin: the same cameras and joints in MuJoCo.
 
-use crate::config::{BaseDriver, Camera, Parent, Rig, Scanner};
+use crate::config::{BaseDriver, Camera, Parent, Rig, Scanner, ScannerDriver};
 use anyhow::bail;
-use drivers::{Error, Live, Sample, Source};
+use drivers::{Devices, Error, Live, Sample, Source};
 use kinematics::{Stamp, Transform};
 use std::sync::Arc;
 
-/// Opens the simulated rig, in lockstep or in real time as the rig file says.
-pub(super) fn open(rig: &Rig) -> anyhow::Result<Box<dyn Source>> {
+/// Opens the simulated rig, in lockstep or in real time as the rig file says; `real` devices deliver beside it in real time.
+pub(super) fn open(rig: &Rig, real: Devices) -> anyhow::Result<Box<dyn Source>> {
     let mut config = config_of(rig)?;
+    let any_real = real.base.is_some() || !real.scanners.is_empty();
     if rig.sim.lockstep {
+        if any_real {
+            bail!(
+                "with sim.lockstep the simulation waits for whoever takes its samples, which devices with the driver udp do not"
+            );
+        }
         return Ok(Box::new(sim::open(&config)?.into_lockstep()));
     }
+    // Real devices tell the time of this computer; alone, the simulation begins at 0.
+    let start = if any_real { drivers::clock::now() } else { Stamp::default() };
     // In real time the end is found here: devices that end would look like devices that fail.
     (config.duration_secs, config.n_images) = (None, None);
-    let sim::LiveRig { devices, truth, .. } = sim::open(&config)?.into_live(Stamp::default())?;
+    let sim::LiveRig { mut devices, truth, .. } = sim::open(&config)?.into_live(start)?;
+    devices.base = devices.base.or(real.base);
+    devices.scanners.extend(real.scanners);
     Ok(Box::new(RealTime {
         live: Live::new(devices)?,
         truth,
         first_camera: Arc::clone(&rig.cameras[0].name),
         n_left: rig.sim.n_images,
-        end: rig.sim.duration_secs.map(|secs| Stamp::default().plus_secs(secs)),
+        end: rig.sim.duration_secs.map(|secs| start.plus_secs(secs)),
     }))
 }
 
@@ -79,7 +89,7 @@ fn config_of(rig: &Rig) -> anyhow::Result<sim::Config> {
         n_images: rig.sim.n_images,
         joint_names: super::chain_of(rig)?.joint_names().to_vec(),
         reading_order: rig.arm.joints.clone(),
-        scanners: rig.scanners.iter().map(scanner_of).collect(),
+        scanners: rig.scanners.iter().filter(|scanner| scanner.driver == ScannerDriver::Sim).map(scanner_of).collect(),
         base: sim::BaseConfig { rate_hz: rig.base.rate_hz, drift_m: rig.base.drift_m, drift_rad: rig.base.drift_rad },
         light_inside_frac: rig.sim.light_inside_frac,
         cameras: rig.cameras.iter().map(camera_of).collect(),

@@ -3,9 +3,14 @@
 use super::{Devices, Opened};
 use crate::config::{Override, Rig};
 use crate::join::{Join, JoinEvent};
-use drivers::Sample;
+use drivers::wire::datagram::{Clock, Head, PoseDatagram, ScanPart, encode_pose, encode_scan};
+use drivers::{RangePoint, Sample};
+use kinematics::Transform;
+use std::net::{SocketAddr, UdpSocket};
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 use toml::Value;
 use trainer::Keyframe;
 
@@ -190,4 +195,77 @@ fn poses_velocities_and_scans_of_moving_bases_agree_with_the_simulator() {
             assert!(scan.points_in_world_m.len() > 4000 && scan.points_in_world_m.iter().all(|point| inside(*point)));
         }
     }
+}
+
+/// An address of the loopback interface that nobody uses.
+fn free_address() -> SocketAddr {
+    UdpSocket::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a free port")
+}
+
+#[test]
+fn what_comes_over_the_network_is_placed_recorded_and_replayed() {
+    const POINT: RangePoint = RangePoint { position_m: [2.0, 0.0, 0.0], ring: 1, offset_micros: 300 };
+    let [to_base, to_lidar] = [free_address(), free_address()];
+    let text = |key, value: &str| Override::new(key, value);
+    let rig = small(
+        "static-arm.toml",
+        &[
+            Override::new("sim.lockstep", false),
+            text("base.driver", "udp"),
+            text("base.address", &to_base.to_string()),
+            text("range.lidar.driver", "udp"),
+            text("range.lidar.address", &to_lidar.to_string()),
+        ],
+    );
+    let opened = super::rig(rig, Devices::Real).expect("a simulated arm, and two sockets");
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    let mut recorder = super::recorder(&path, &opened.rig).expect("a new file");
+    let mut join = Join::new(&opened.rig).expect("a good rig");
+    let mut source = opened.source;
+    let stop = AtomicBool::new(false);
+    let mut told = Vec::new();
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            let socket = UdpSocket::bind("127.0.0.1:0").expect("a free port");
+            for seq in 0.. {
+                let head = Head { seq, clock: Clock::Monotonic, stamp_nanos: drivers::clock::now().0 };
+                let world_from_base = Transform::translation(0.5, 0.0, 0.0);
+                socket.send_to(&encode_pose(&PoseDatagram { head, world_from_base }), to_base).expect("loopback");
+                if seq % 10 == 0 {
+                    let part = ScanPart { head, frame: "lidar".into(), part: 0, n_parts: 1, points: vec![POINT] };
+                    socket.send_to(&encode_scan(&part), to_lidar).expect("loopback");
+                }
+                std::thread::sleep(Duration::from_millis(10));
+                if stop.load(Ordering::Relaxed) {
+                    break;
+                }
+            }
+        });
+        while join.range_scans().count() < 5 || !told.iter().any(|sample| matches!(sample, Sample::Image(_))) {
+            let sample = source.next_sample().expect("the rig works").expect("it has no end");
+            recorder.write(&sample).expect("room on the disk");
+            join.push(sample.clone());
+            told.push(sample);
+        }
+        stop.store(true, Ordering::Relaxed);
+    });
+    recorder.finish().expect("room on the disk");
+    // Where the scanner is on the base, and the base in the world.
+    let scan = join.range_scans().next().expect("five of them");
+    let [x, y, z] = scan.points_in_world_m[0];
+    assert!((x - 2.5).abs() < 1e-6 && y.abs() < 1e-6 && z.abs() < 1e-6, "{x} {y} {z}");
+    let mut replay = super::recording(&path, None, &[]).expect("a recording").source;
+    let replayed: Vec<Sample> = std::iter::from_fn(|| replay.next_sample().expect("readable")).collect();
+    assert!(replayed == told, "the replay differs");
+}
+
+#[test]
+fn lockstep_and_the_network_are_refused_together() {
+    let rig = small(
+        "static-arm.toml",
+        &[Override::new("base.driver", "udp"), Override::new("base.address", free_address().to_string())],
+    );
+    let refused = super::rig(rig, Devices::Real).err().expect("one waits, the other does not").to_string();
+    assert!(refused.contains("sim.lockstep") && refused.contains("udp"), "{refused}");
 }

@@ -10,6 +10,8 @@
 //           inverse square of distance, drop behind the surface). Ours: distances are taken along the surface's normal,
 //           and what is seen through loses weight instead of gaining a distance it cannot have: to see past a voxel says
 //           that nothing solid is there, not how far the nearest surface is.
+// software  lanes go through a loop together, once more where its test comes first, and through what is not for them too: so
+//           loops are tested at their end, and a column's colors, which few voxels have, wait for a loop of their own
 
 #import field
 #import field_status
@@ -38,7 +40,7 @@ fn reading_at(pixel: vec2i) -> vec2f {
     return readings[u32(inside.y) * frame.depth_size_px.x + u32(inside.x)];
 }
 
-// Between four readings where all are believed, else the nearest one's.
+// Between four readings where all are believed, else the nearest one.
 fn reading_near(place_px: vec2f) -> vec2f {
     let corner = floor(place_px - 0.5);
     let share = place_px - 0.5 - corner;
@@ -49,7 +51,8 @@ fn reading_near(place_px: vec2f) -> vec2f {
     let d = reading_at(base + vec2i(1, 1));
     let all_believed = min(min(a.x, b.x), min(c.x, d.x)) > 0.0;
     let between = mix(mix(a, b, share.x), mix(c, d, share.x), share.y);
-    return select(reading_at(vec2i(floor(place_px))), between, all_believed);
+    let nearest = select(select(a, b, share.x >= 0.5), select(c, d, share.x >= 0.5), share.y >= 0.5);
+    return select(nearest, between, all_believed);
 }
 
 fn pixel_at(pixel: vec2i) -> vec4f {
@@ -83,20 +86,27 @@ fn fuse_color(at: u32, point_in_field: vec3f, gained: u32) {
     colors[at] = vec2u(rgb.x | (rgb.y << 16u), rgb.z | (min(sum, field.max_weight) << 16u));
 }
 
-// Whether the voxel changed.
-fn fuse(at: u32, point_in_field: vec3f) -> bool {
+// What became of a voxel.
+struct Fused {
+    changed: bool,
+    color_gain: u32,          // weight that its color is to gain; 0: too far from the surface
+}
+
+const UNCHANGED = Fused(false, 0u);
+
+fn fuse(at: u32, point_in_field: vec3f) -> Fused {
     let point = depth_from_field(frame, point_in_field);
     let place_px = frame.depth_focal_px * point.xy / point.z + frame.depth_principal_px;
     let inside = point.z > 0.0 && all(place_px >= vec2f(0.0)) && all(place_px < vec2f(frame.depth_size_px));
-    if !inside { return false; }
+    if !inside { return UNCHANGED; }
     let reading = reading_near(place_px);
-    if !(reading.x > 0.0) { return false; }
+    if !(reading.x > 0.0) { return UNCHANGED; }
     let distance_m = (reading.x - point.z) * max(reading.y, MIN_TURNED);
     let truncation_m = truncation_at(field, reading.x);
     let ray_m = length(ray_of(frame, place_px));
     // Along the ray, not the normal: past the rim of a thing a ray soon leaves it again.
     let behind_m = (point.z - reading.x) * ray_m;
-    if !(behind_m <= truncation_m) { return false; } // Hidden.
+    if !(behind_m <= truncation_m) { return UNCHANGED; } // Hidden.
     let nearness = min(1.0, 1.0 / (reading.x * reading.x));
     let behind = clamp((truncation_m - behind_m) / (truncation_m - field.voxel_m), 0.0, 1.0);
     let cosine = reading.y / ray_m;
@@ -106,33 +116,64 @@ fn fuse(at: u32, point_in_field: vec3f) -> bool {
     if distance_m > truncation_m {
         // Seen through: that counts against what was taken for solid, and says nothing else. How well it is seen is a
         // matter of where the voxel is, not of what lies behind it.
-        if weight == 0u || stored_distance(old) >= 0.0 { return false; }
+        if weight == 0u || stored_distance(old) >= 0.0 { return UNCHANGED; }
         let lost = u32(max(floor(CARVING * WEIGHT_ONE * min(1.0, 1.0 / (point.z * point.z)) + 0.5), 1.0));
         geometry[at] = select(old - (lost << 16u), 0u, lost >= weight);
-        return true;
+        return Fused(true, 0u);
     }
     let gained = u32(clamp(floor(WEIGHT_ONE * gain + 0.5), 1.0, WEIGHT_ONE));
     let sum = weight + gained;
     let mean = (stored_distance(old) * f32(weight) + distance_m / field.scale_m * f32(gained)) / f32(sum);
     let stored = i32(floor(clamp(mean, -1.0, 1.0) * 32767.0 + 0.5));
     geometry[at] = (u32(stored) & 0xffffu) | (min(sum, field.max_weight) << 16u);
-    if abs(distance_m) <= COLOR_VOXELS * field.voxel_m {
-        fuse_color(at, point_in_field, gained);
-    }
-    return true;
+    return Fused(true, select(0u, gained, abs(distance_m) <= COLOR_VOXELS * field.voxel_m));
+}
+
+fn center_of(first: vec3i, z: u32) -> vec3f {
+    return (vec3f(first + vec3i(0, 0, i32(z))) + 0.5) * field.voxel_m;
 }
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let n_visible = status[N_VISIBLE];
-    for (var at = folded(wg, n_wgs); at < n_visible; at += n_wgs.x * n_wgs.y) {
+    var at = folded(wg, n_wgs);
+    if at >= n_visible { return; } // Allowed here: no barrier below.
+    loop {
         let slot = visible[at];
+        let begin = slot * BLOCK_VOXELS + lane;
         let first = coords[slot].xyz * 8 + vec3i(vec3u(lane & 7u, lane >> 3u, 0u));
         var any_changed = false;
-        for (var z = 0; z < 8; z++) {
-            let center = (vec3f(first + vec3i(0, 0, z)) + 0.5) * field.voxel_m;
-            any_changed = fuse(slot * BLOCK_VOXELS + u32(z) * 64u + lane, center) || any_changed;
+        var due = 0u;         // Bit z: the color of this voxel is due,
+        var gains = vec2u(0u); // and byte z is the weight it gains, less one.
+        var z = 0u;
+        loop {
+            let fused = fuse(begin + z * 64u, center_of(first, z));
+            any_changed = any_changed || fused.changed;
+            if fused.color_gain != 0u {
+                due |= 1u << z;
+                let byte = (fused.color_gain - 1u) << (8u * (z & 3u));
+                gains |= select(vec2u(byte, 0u), vec2u(0u, byte), z >= 4u);
+            }
+            continuing {
+                z++;
+                break if z >= 8u;
+            }
+        }
+        loop {
+            if due != 0u {
+                let z = firstTrailingBit(due);
+                let byte = select(gains.x, gains.y, z >= 4u) >> (8u * (z & 3u));
+                fuse_color(begin + z * 64u, center_of(first, z), (byte & 255u) + 1u);
+            }
+            continuing {
+                due &= due - 1u;
+                break if due == 0u;
+            }
         }
         if any_changed { atomicStore(&changed[slot], 1u); }
+        continuing {
+            at += n_wgs.x * n_wgs.y;
+            break if at >= n_visible;
+        }
     }
 }

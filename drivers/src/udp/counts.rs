@@ -1,0 +1,59 @@
+//! What became of the datagrams of one device.
+
+use std::fmt;
+
+/// Datagrams of one device since it was opened.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// That came.
+    pub n_received: u64,
+    /// That do not follow the format, name another device, or have an impossible stamp.
+    pub n_refused: u64,
+    /// Scans or poses whose numbers were passed over, and parts of scans that never came.
+    pub n_lost: u64,
+    /// That came twice, or after a later one.
+    pub n_late: u64,
+    /// That gave way to newer ones because nobody took them.
+    pub n_dropped: u64,
+    /// How often the sender began to count anew.
+    pub n_restarts: u64,
+}
+
+/// Counts `more` of a kind, and logs it where that doubles the count at least: soon at first, and never a flood.
+pub(super) fn tell(device: &str, n: &mut u64, more: u64, what: impl fmt::Display) {
+    let before = n.checked_ilog2();
+    *n = n.saturating_add(more);
+    if n.checked_ilog2() != before {
+        log::warn!("{device}: {what} ({n} so far)");
+    }
+}
+
+impl Counts {
+    /// Logs what went wrong, if anything did.
+    pub(super) fn summarize(&self, device: &str) {
+        let Self { n_received, n_refused, n_lost, n_late, n_dropped, n_restarts } = self;
+        if [n_refused, n_lost, n_late, n_dropped, n_restarts].iter().any(|n| **n > 0) {
+            log::warn!(
+                "{device}: of {n_received} datagrams {n_refused} were refused, {n_late} came late or twice, {n_dropped} gave way \
+                 to newer ones; {n_lost} scans, poses or parts were lost; the sender began anew {n_restarts} times"
+            );
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn counts_end_at_the_largest_number() {
+        let mut n = 0;
+        for _ in 0..1_000_000 {
+            tell("it", &mut n, 1, "comes");
+        }
+        tell("it", &mut n, 0, "does not");
+        assert_eq!(n, 1_000_000);
+        tell("it", &mut n, u64::MAX, "comes at once");
+        assert_eq!(n, u64::MAX);
+    }
+}

@@ -1,0 +1,181 @@
+//! A socket read by a thread of its own, which stamps datagrams as they arrive.
+
+use crate::{Error, clock};
+use kinematics::Stamp;
+use std::collections::VecDeque;
+use std::io::ErrorKind;
+use std::net::{SocketAddr, UdpSocket};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+/// Bytes of datagrams that may wait; past them the oldest goes.
+const MAX_WAITING_BYTES: usize = 16 << 20;
+/// What a datagram takes besides its bytes, about: none is free.
+const OVERHEAD_BYTES: usize = 128;
+/// No datagram is longer.
+const MAX_DATAGRAM_BYTES: usize = 65_536;
+/// How soon the thread notices that it is to stop.
+const POLL: Duration = Duration::from_millis(100);
+
+/// One datagram.
+pub(super) struct Arrived {
+    pub(super) at: Stamp,
+    pub(super) bytes: Vec<u8>,
+    /// Those before it that gave way.
+    pub(super) n_dropped: u64,
+}
+
+/// A bound socket and its thread; dropping it frees the port.
+#[derive(Debug)]
+pub(super) struct Receiver {
+    device: String,
+    address: SocketAddr,
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    state: Mutex<State>,
+    arrived: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    queue: VecDeque<(Stamp, Vec<u8>)>,
+    n_bytes: usize,
+    n_dropped: u64,
+    error: Option<std::io::Error>,
+    stop: bool,
+}
+
+impl Receiver {
+    /// Listens; port 0 takes a free one. `device` names it in messages.
+    pub(super) fn open(device: String, address: SocketAddr) -> Result<Self, Error> {
+        let bound = UdpSocket::bind(address).and_then(|socket| {
+            socket.set_read_timeout(Some(POLL))?;
+            Ok((socket.local_addr()?, socket))
+        });
+        let (address, socket) = match bound {
+            Ok(bound) => bound,
+            Err(source) => return Err(Error::Listen { device, address, source }),
+        };
+        if !address.ip().is_loopback() {
+            log::warn!("{device}: whoever reaches {address} can send to it: there is no password in this format");
+        }
+        let shared = Arc::new(Shared::default());
+        let reading = Arc::clone(&shared);
+        let thread = std::thread::Builder::new().name(device.clone()).spawn(move || reading.read(&socket));
+        match thread {
+            Ok(thread) => Ok(Self { device, address, shared, thread: Some(thread) }),
+            Err(source) => Err(Error::Thread { device, source }),
+        }
+    }
+
+    /// Where it listens.
+    pub(super) fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// What it is called in messages.
+    pub(super) fn device(&self) -> &str {
+        &self.device
+    }
+
+    /// The oldest datagram that waits; `None` when none came until then.
+    pub(super) fn next(&self, until: Instant) -> Result<Option<Arrived>, Error> {
+        let mut state = self.shared.lock();
+        loop {
+            if let Some((at, bytes)) = state.queue.pop_front() {
+                state.n_bytes -= bytes.len() + OVERHEAD_BYTES;
+                return Ok(Some(Arrived { at, bytes, n_dropped: std::mem::take(&mut state.n_dropped) }));
+            }
+            if let Some(source) = state.error.take() {
+                return Err(Error::Network { device: self.device.clone(), source });
+            }
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Ok(None);
+            }
+            state = self.shared.arrived.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+}
+
+impl Shared {
+    /// The state, also after a thread panicked while it held it: the queue is never left half changed.
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn read(&self, socket: &UdpSocket) {
+        let mut buffer = vec![0; MAX_DATAGRAM_BYTES];
+        loop {
+            let received = socket.recv(&mut buffer);
+            let at = clock::now();
+            let mut state = self.lock();
+            if state.stop {
+                return;
+            }
+            match received {
+                Ok(n) => state.put(at, buffer[..n].to_vec()),
+                Err(error)
+                    if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) =>
+                {
+                    continue;
+                }
+                Err(error) => {
+                    state.error = Some(error);
+                    self.arrived.notify_all();
+                    return;
+                }
+            }
+            self.arrived.notify_all();
+        }
+    }
+}
+
+impl State {
+    fn put(&mut self, at: Stamp, bytes: Vec<u8>) {
+        self.n_bytes += bytes.len() + OVERHEAD_BYTES;
+        self.queue.push_back((at, bytes));
+        while self.n_bytes > MAX_WAITING_BYTES
+            && let Some((_, oldest)) = self.queue.pop_front()
+        {
+            self.n_bytes -= oldest.len() + OVERHEAD_BYTES;
+            self.n_dropped += 1;
+        }
+    }
+}
+
+impl Drop for Receiver {
+    fn drop(&mut self) {
+        self.shared.lock().stop = true;
+        if let Some(thread) = self.thread.take() {
+            // A panic of the thread was reported by the panic hook.
+            let _ = thread.join();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_slow_caller_loses_the_oldest_and_memory_is_bounded() {
+        let mut state = State::default();
+        for ix in 0..1000 {
+            state.put(Stamp(ix), vec![0; 60_000]);
+            assert!(state.n_bytes <= MAX_WAITING_BYTES);
+        }
+        let n_left = state.queue.len();
+        assert_eq!(n_left as u64 + state.n_dropped, 1000);
+        assert_eq!(state.queue.back().expect("the newest").0, Stamp(999));
+        for ix in 0..1_000_000 {
+            state.put(Stamp(ix), Vec::new());
+        }
+        assert!(state.queue.len() <= MAX_WAITING_BYTES / OVERHEAD_BYTES, "empty datagrams are bounded too");
+    }
+}

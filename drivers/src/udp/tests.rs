@@ -1,0 +1,168 @@
+//! Over a real socket of the loopback interface.
+
+use super::{Counts, UdpBase, UdpScanner};
+use crate::wire::datagram::{Clock, Head, PoseDatagram, ScanPart, encode_pose, encode_scan};
+use crate::{Base, Devices, Error, Live, RangePoint, RangeScanner, Sample, Source, clock};
+use kinematics::Transform;
+use std::net::{SocketAddr, UdpSocket};
+use std::time::{Duration, Instant};
+
+/// Long, as a busy machine may be slow; nothing waits so long where all is well.
+const PATIENCE: Duration = Duration::from_secs(20);
+/// For what does not come.
+const SHORT: Duration = Duration::from_millis(150);
+const FREE_PORT: &str = "127.0.0.1:0";
+
+fn sender(to: SocketAddr) -> impl Fn(&[u8]) {
+    let socket = UdpSocket::bind(FREE_PORT).unwrap();
+    move |bytes| assert_eq!(socket.send_to(bytes, to).unwrap(), bytes.len())
+}
+
+fn scanner() -> (UdpScanner, impl Fn(&[u8])) {
+    let scanner = UdpScanner::open("lidar", FREE_PORT.parse().unwrap()).unwrap();
+    let send = sender(scanner.address());
+    (scanner, send)
+}
+
+fn now(seq: u64) -> Head {
+    Head { seq, clock: Clock::Monotonic, stamp_nanos: clock::now().0 }
+}
+
+/// The part of a scan whose one echo is so far away.
+fn part(head: Head, part: u32, n_parts: u32, range_m: f32) -> Vec<u8> {
+    let point = RangePoint { position_m: [range_m, 0.0, 0.0], ring: 2, offset_micros: 5 };
+    encode_scan(&ScanPart { head, frame: "lidar".into(), part, n_parts, points: vec![point] })
+}
+
+fn ranges(scanner: &mut UdpScanner) -> Vec<f32> {
+    scanner.next_scan(PATIENCE).unwrap().points.iter().map(|point| point.position_m[0]).collect()
+}
+
+fn pose(head: Head, x_m: f64) -> Vec<u8> {
+    encode_pose(&PoseDatagram { head, world_from_base: Transform::translation(x_m, 0.0, 0.0) })
+}
+
+#[test]
+fn scans_come_whole_and_with_their_stamps() {
+    let (mut scanner, send) = scanner();
+    let head = now(0);
+    send(&part(head, 0, 1, 1.5));
+    let scan = scanner.next_scan(PATIENCE).unwrap();
+    assert_eq!((&*scan.scanner, scan.stamp.0), ("lidar", head.stamp_nanos));
+    let expected = RangePoint { position_m: [1.5, 0.0, 0.0], ring: 2, offset_micros: 5 };
+    assert_eq!(*scan.points, [expected]);
+    // In parts that come in any order.
+    let head = now(1);
+    for (ix, range_m) in [(2, 3.0), (0, 1.0), (1, 2.0)] {
+        send(&part(head, ix, 3, range_m));
+    }
+    assert_eq!(ranges(&mut scanner), [1.0, 2.0, 3.0]);
+    // A clock of its own: the stamp is the arrival's, at first.
+    let before = clock::now();
+    send(&part(Head { seq: 2, clock: Clock::Device, stamp_nanos: -77 }, 0, 1, 1.0));
+    let scan = scanner.next_scan(PATIENCE).unwrap();
+    assert!(scan.stamp > before && scan.stamp <= clock::now());
+    assert_eq!(scanner.counts(), Counts { n_received: 5, ..Counts::default() });
+}
+
+#[test]
+fn what_is_lost_doubled_or_late_is_counted() {
+    let (mut scanner, send) = scanner();
+    let (first, second, fifth, sixth) = (now(1), now(2), now(5), now(6));
+    send(&part(first, 0, 1, 1.0));
+    send(&part(first, 0, 1, 1.0)); // Twice.
+    send(&part(second, 0, 2, 2.0)); // Its other half is lost ...
+    send(&part(second, 0, 2, 2.0)); // ... and this one comes twice.
+    send(&part(fifth, 1, 2, 5.0)); // Two scans are lost before it.
+    send(&part(second, 1, 2, 2.5)); // Too late now.
+    send(&part(fifth, 0, 3, 5.0)); // Contradicts itself.
+    send(&part(fifth, 0, 2, 4.5));
+    send(&part(sixth, 0, 1, 6.0));
+    assert_eq!(ranges(&mut scanner), [1.0]);
+    assert_eq!(ranges(&mut scanner), [2.0]);
+    assert_eq!(ranges(&mut scanner), [4.5, 5.0]);
+    assert_eq!(ranges(&mut scanner), [6.0]);
+    let expected = Counts { n_received: 9, n_refused: 1, n_lost: 3, n_late: 3, ..Counts::default() };
+    assert_eq!(scanner.counts(), expected);
+}
+
+#[test]
+fn nonsense_is_refused_and_stops_nothing() {
+    let (mut scanner, send) = scanner();
+    let good = part(now(0), 0, 1, 1.0);
+    let mut n_sent = 0;
+    let mut junk = |bytes: &[u8]| {
+        send(bytes);
+        n_sent += 1;
+    };
+    junk(b"");
+    junk(b"null");
+    junk(&[0xff; 1400]);
+    junk(&vec![b'['; 60_000]);
+    for end in [1, good.len() / 3, good.len() - 1] {
+        junk(&good[..end]);
+    }
+    junk(&pose(now(0), 1.0));
+    junk(&part(Head { stamp_nanos: i64::MAX, ..now(3) }, 0, 1, 1.0));
+    junk(&part(Head { stamp_nanos: i64::MIN, ..now(4) }, 0, 1, 1.0));
+    junk(String::from_utf8(part(now(5), 0, 1, 1.0)).unwrap().replace("lidar", "radar").as_bytes());
+    junk(&part(Head { seq: u64::MAX, clock: Clock::Monotonic, stamp_nanos: 0 }, 0, 1, 1.0));
+    let n_junk = n_sent;
+    send(&part(now(0), 0, 1, 7.0));
+    assert_eq!(ranges(&mut scanner), [7.0]);
+    let counts = scanner.counts();
+    assert_eq!((counts.n_received, counts.n_refused), (n_junk + 1, n_junk));
+    // Nothing but nonsense: the wait ends all the same.
+    for _ in 0..1000 {
+        send(b"?");
+    }
+    let begun = Instant::now();
+    let silent = scanner.next_scan(SHORT).unwrap_err();
+    assert!(matches!(silent, Error::NoScan { .. }), "{silent}");
+    assert!(begun.elapsed() < PATIENCE);
+}
+
+#[test]
+fn base_poses_come_in_order_and_the_port_is_free_again() {
+    let mut base = UdpBase::open(FREE_PORT.parse().unwrap()).unwrap();
+    let (address, send) = (base.address(), sender(base.address()));
+    assert!(matches!(base.next_pose(SHORT), Err(Error::NoBasePose { .. })));
+    let heads: Vec<Head> = (0..4).map(now).collect();
+    for ix in [0, 1, 1, 3, 2] {
+        send(&pose(heads[ix], ix as f64));
+    }
+    for ix in [0, 1, 3] {
+        let told = base.next_pose(PATIENCE).unwrap();
+        assert_eq!((told.stamp.0, told.world_from_base.translation.x), (heads[ix].stamp_nanos, ix as f64));
+    }
+    assert!(base.next_pose(SHORT).is_err());
+    let expected = Counts { n_received: 5, n_lost: 1, n_late: 2, ..Counts::default() };
+    assert_eq!(base.counts(), expected);
+    let taken = UdpBase::open(address).unwrap_err();
+    assert!(taken.to_string().contains(&address.to_string()), "{taken}");
+    drop(base);
+    UdpBase::open(address).unwrap();
+}
+
+#[test]
+fn live_merges_both_and_names_the_one_that_falls_silent() {
+    let (scanner, send_scan) = scanner();
+    let base = UdpBase::open(FREE_PORT.parse().unwrap()).unwrap();
+    let send_pose = sender(base.address());
+    let devices = Devices { base: Some(Box::new(base)), scanners: vec![Box::new(scanner)], ..Devices::default() };
+    let mut live = Live::new(devices).unwrap();
+    for seq in 0..3 {
+        send_pose(&pose(now(seq), 0.0));
+        send_scan(&part(now(seq), 0, 1, 1.0));
+    }
+    let mut n = [0; 2];
+    while n != [3, 3] {
+        match live.next_sample().unwrap() {
+            Some(Sample::Base(_)) => n[0] += 1,
+            Some(Sample::Range(_)) => n[1] += 1,
+            other => panic!("{other:?}"),
+        }
+    }
+    let silent = live.next_sample().unwrap_err();
+    assert!(matches!(silent, Error::NoScan { .. } | Error::NoBasePose { .. }), "{silent}");
+}

@@ -1,0 +1,406 @@
+//! What range scanners and bases send over UDP: one JSON object a datagram, every field in `docs/udp.md`.
+
+use super::Malformed;
+use crate::RangePoint;
+use kinematics::Transform;
+use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+use serde::{Deserialize, Serialize};
+
+/// Version of the format.
+pub const VERSION: u32 = 1;
+/// Most datagrams that one scan may be cut into.
+pub const MAX_PARTS: u32 = 64;
+/// Coordinates and ranges beyond this are slips, metres.
+const FAR_M: f64 = 1e4;
+/// Angles beyond this are slips, rad.
+const MOST_RAD: f64 = 100.0;
+/// Most characters of a parser's message that are told.
+const MAX_TOLD: usize = 200;
+/// How far from one the length of a quaternion may be.
+const UNIT_WITHIN: f64 = 1e-3;
+
+/// Which clock a stamp is on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Clock {
+    /// `CLOCK_MONOTONIC` of the computer that receives: the sender runs on it too.
+    Monotonic,
+    /// Any other that runs evenly; it is mapped by when datagrams arrive.
+    Device,
+}
+
+/// What every datagram says.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Head {
+    /// One more with every scan or pose.
+    pub seq: u64,
+    /// Which clock the stamp is on.
+    pub clock: Clock,
+    /// When it was so, or when the turn began, nanoseconds.
+    pub stamp_nanos: i64,
+}
+
+/// A range scan, or a part of one.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ScanPart {
+    /// The same in all parts of a scan.
+    pub head: Head,
+    /// Name of the scanner in the rig file.
+    pub frame: String,
+    /// Which part this is, from 0.
+    pub part: u32,
+    /// How many there are, 1 to [`MAX_PARTS`].
+    pub n_parts: u32,
+    /// Its echoes; directions without one have none.
+    pub points: Vec<RangePoint>,
+}
+
+/// Where a base was.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PoseDatagram {
+    /// When.
+    pub head: Head,
+    /// Pose of the base.
+    pub world_from_base: Transform,
+}
+
+/// What is looked at before anything else; other fields may be anything.
+#[derive(Deserialize)]
+struct Kind {
+    kind: String,
+    version: u32,
+}
+
+#[derive(Serialize, Deserialize)]
+struct WireScan {
+    kind: String,
+    version: u32,
+    seq: u64,
+    clock: Clock,
+    stamp_nanos: i64,
+    frame: String,
+    #[serde(default)]
+    part: u32,
+    #[serde(default = "one")]
+    parts: u32,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    points_m: Option<Vec<f32>>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    ranges_m: Option<Vec<Option<f32>>>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    first_rad: Option<f64>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    step_rad: Option<f64>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    elevation_rad: Option<f64>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    rings: Option<Vec<u16>>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    offsets_micros: Option<Vec<u32>>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct WirePose {
+    kind: String,
+    version: u32,
+    seq: u64,
+    clock: Clock,
+    stamp_nanos: i64,
+    world_from_base: Pose,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Pose {
+    xyz_m: [f64; 3],
+    quat_xyzw: [f64; 4],
+}
+
+const SCAN: &str = "range";
+const POSE: &str = "base";
+
+fn one() -> u32 {
+    1
+}
+
+/// A part of a scan as a datagram; every bit of it comes back from [`decode_scan`].
+pub fn encode_scan(part: &ScanPart) -> Vec<u8> {
+    let ScanPart { head, frame, part, n_parts, points } = part;
+    let wire = WireScan {
+        kind: SCAN.to_owned(),
+        version: VERSION,
+        seq: head.seq,
+        clock: head.clock,
+        stamp_nanos: head.stamp_nanos,
+        frame: frame.clone(),
+        part: *part,
+        parts: *n_parts,
+        points_m: Some(points.iter().flat_map(|point| point.position_m).collect()),
+        ranges_m: None,
+        first_rad: None,
+        step_rad: None,
+        elevation_rad: None,
+        rings: Some(points.iter().map(|point| point.ring).collect()),
+        offsets_micros: Some(points.iter().map(|point| point.offset_micros).collect()),
+    };
+    serde_json::to_vec(&wire).expect("numbers and lists always serialize")
+}
+
+/// A base's pose as a datagram; every bit of it comes back from [`decode_pose`].
+pub fn encode_pose(pose: &PoseDatagram) -> Vec<u8> {
+    let PoseDatagram { head, world_from_base } = pose;
+    let wire = WirePose {
+        kind: POSE.to_owned(),
+        version: VERSION,
+        seq: head.seq,
+        clock: head.clock,
+        stamp_nanos: head.stamp_nanos,
+        world_from_base: Pose {
+            xyz_m: world_from_base.translation.vector.into(),
+            quat_xyzw: world_from_base.rotation.coords.into(),
+        },
+    };
+    serde_json::to_vec(&wire).expect("numbers and lists always serialize")
+}
+
+/// Reads a part of a scan.
+pub fn decode_scan(bytes: &[u8]) -> Result<ScanPart, Malformed> {
+    check_kind(bytes, SCAN)?;
+    let wire: WireScan = parsed(bytes)?;
+    if wire.parts == 0 || wire.parts > MAX_PARTS || wire.part >= wire.parts {
+        return Err(amiss(format!(
+            "part is {} of {}, must be below parts, and parts 1 to {MAX_PARTS}",
+            wire.part, wire.parts
+        )));
+    }
+    let places = places(&wire)?;
+    let n = places.len();
+    let fits = |name, len: Option<usize>| match len {
+        Some(len) if len != n => Err(amiss(format!("{name} has {len} entries for {n} echoes"))),
+        _ => Ok(()),
+    };
+    fits("rings", wire.rings.as_ref().map(Vec::len))?;
+    fits("offsets_micros", wire.offsets_micros.as_ref().map(Vec::len))?;
+    let point = |(ix, place): (usize, Option<[f32; 3]>)| {
+        Some(RangePoint {
+            position_m: place?,
+            ring: wire.rings.as_ref().map_or(0, |rings| rings[ix]),
+            offset_micros: wire.offsets_micros.as_ref().map_or(0, |offsets| offsets[ix]),
+        })
+    };
+    Ok(ScanPart {
+        head: Head { seq: wire.seq, clock: wire.clock, stamp_nanos: wire.stamp_nanos },
+        points: places.into_iter().enumerate().filter_map(point).collect(),
+        frame: wire.frame,
+        part: wire.part,
+        n_parts: wire.parts,
+    })
+}
+
+/// Reads a base's pose.
+pub fn decode_pose(bytes: &[u8]) -> Result<PoseDatagram, Malformed> {
+    check_kind(bytes, POSE)?;
+    let wire: WirePose = parsed(bytes)?;
+    let Pose { xyz_m: [x, y, z], quat_xyzw: [i, j, k, w] } = wire.world_from_base;
+    if ![x, y, z].iter().all(|along| along.abs() <= FAR_M) {
+        return Err(amiss(format!("xyz_m has a number beyond {FAR_M} m")));
+    }
+    let quaternion = Quaternion::new(w, i, j, k);
+    // Written so that no number is no length.
+    let is_unit = (quaternion.norm() - 1.0).abs() <= UNIT_WITHIN;
+    if !is_unit {
+        return Err(amiss("quat_xyzw has not the length 1".to_owned()));
+    }
+    let rotation = match (quaternion.norm() - 1.0).abs() < 1e-12 {
+        true => UnitQuaternion::new_unchecked(quaternion),
+        false => UnitQuaternion::new_normalize(quaternion),
+    };
+    Ok(PoseDatagram {
+        head: Head { seq: wire.seq, clock: wire.clock, stamp_nanos: wire.stamp_nanos },
+        world_from_base: Transform::from_parts(Translation3::new(x, y, z), rotation),
+    })
+}
+
+/// A place for each direction of a part, `None` without an echo.
+fn places(wire: &WireScan) -> Result<Vec<Option<[f32; 3]>>, Malformed> {
+    match (&wire.points_m, &wire.ranges_m) {
+        (Some(numbers), None) => {
+            let (points, rest) = numbers.as_chunks::<3>();
+            if !rest.is_empty() {
+                return Err(amiss(format!("points_m has {} numbers, not three a point", numbers.len())));
+            }
+            match points.iter().flatten().all(|along| f64::from(along.abs()) <= FAR_M) {
+                true => Ok(points.iter().map(|point| Some(*point)).collect()),
+                false => Err(amiss(format!("points_m has a number beyond {FAR_M} m"))),
+            }
+        }
+        (None, Some(ranges)) => {
+            let angle = |name, angle: Option<f64>| match angle {
+                Some(angle) if angle.abs() <= MOST_RAD => Ok(angle),
+                _ => Err(amiss(format!("ranges_m needs {name} between -{MOST_RAD} and {MOST_RAD} rad"))),
+            };
+            let (first, step) = (angle("first_rad", wire.first_rad)?, angle("step_rad", wire.step_rad)?);
+            let elevation = angle("elevation_rad", Some(wire.elevation_rad.unwrap_or(0.0)))?;
+            let place = |(ix, range): (usize, &Option<f32>)| {
+                let Some(range_m) = range.map(f64::from) else { return Ok(None) };
+                match (0.0..=FAR_M).contains(&range_m) {
+                    true => Ok(Some(place_of(range_m, first + ix as f64 * step, elevation))),
+                    false => Err(amiss(format!("ranges_m has a number outside 0 to {FAR_M} m"))),
+                }
+            };
+            ranges.iter().enumerate().map(place).collect()
+        }
+        _ => Err(amiss("either points_m or ranges_m is needed, and not both".to_owned())),
+    }
+}
+
+/// Where an echo is whose azimuth counts from x towards y, and whose elevation from that plane towards z.
+#[expect(clippy::cast_possible_truncation, reason = "metres within 10 km")]
+fn place_of(range_m: f64, azimuth_rad: f64, elevation_rad: f64) -> [f32; 3] {
+    let across_m = range_m * elevation_rad.cos();
+    [across_m * azimuth_rad.cos(), across_m * azimuth_rad.sin(), range_m * elevation_rad.sin()]
+        .map(|along| along as f32)
+}
+
+fn check_kind(bytes: &[u8], wanted: &'static str) -> Result<(), Malformed> {
+    let Kind { kind, version } = parsed(bytes)?;
+    if kind != wanted {
+        // Not the sender's own text, which may be of any length.
+        return Err(amiss(format!("the kind is not {wanted:?}")));
+    }
+    match version == VERSION {
+        true => Ok(()),
+        false => Err(amiss(format!("version {version}, this program speaks {VERSION}"))),
+    }
+}
+
+fn parsed<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, Malformed> {
+    // The parser may repeat the sender's text, which may be long and hold anything: it goes into logs.
+    let told = |error: serde_json::Error| {
+        error.to_string().chars().take(MAX_TOLD).map(|c| if c.is_control() { '?' } else { c }).collect()
+    };
+    serde_json::from_slice(bytes).map_err(|error| amiss(told(error)))
+}
+
+fn amiss(reason: String) -> Malformed {
+    Malformed::Json { reason }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const HEAD: Head = Head { seq: 7, clock: Clock::Monotonic, stamp_nanos: 1_234_567_890_123 };
+
+    fn part() -> ScanPart {
+        let point = |ix: u16| RangePoint {
+            position_m: [0.1 + f32::from(ix), -1.0 / 3.0, 1e-7],
+            ring: ix,
+            offset_micros: 100 * u32::from(ix),
+        };
+        ScanPart { head: HEAD, frame: "lidar".into(), part: 1, n_parts: 3, points: (0..5).map(point).collect() }
+    }
+
+    fn pose() -> PoseDatagram {
+        let rotation = UnitQuaternion::from_euler_angles(0.1, -0.2, 3.0);
+        let world_from_base = Transform::from_parts(Translation3::new(0.1, -1.0 / 3.0, 1e3), rotation);
+        PoseDatagram { head: Head { clock: Clock::Device, ..HEAD }, world_from_base }
+    }
+
+    fn refused_scan(fields: &str) -> String {
+        let text = format!(
+            r#"{{"kind":"range","version":1,"seq":1,"clock":"device","stamp_nanos":5,"frame":"lidar",{fields}}}"#
+        );
+        decode_scan(text.as_bytes()).expect_err(fields).to_string()
+    }
+
+    #[test]
+    fn what_is_sent_comes_back_bit_for_bit() {
+        assert_eq!(decode_scan(&encode_scan(&part())).expect("own bytes"), part());
+        assert_eq!(decode_pose(&encode_pose(&pose())).expect("own bytes"), pose());
+    }
+
+    #[test]
+    fn the_datagrams_of_the_documentation_are_read() {
+        let page = include_str!("../../../docs/udp.md");
+        let examples: Vec<&str> = page.lines().filter(|line| line.starts_with(r#"{"kind""#)).collect();
+        let scans: Vec<ScanPart> = examples.iter().filter_map(|text| decode_scan(text.as_bytes()).ok()).collect();
+        let poses = examples.iter().filter(|text| decode_pose(text.as_bytes()).is_ok()).count();
+        assert_eq!((examples.len(), scans.len(), poses), (3, 2, 1));
+        // Ahead, then a direction without echo, then to the left.
+        let ranges = &scans[1].points;
+        assert_eq!(ranges.len(), 2);
+        assert!((ranges[0].position_m[0] - 2.0).abs() < 1e-6 && ranges[0].position_m[1].abs() < 1e-6, "{ranges:?}");
+        assert!((ranges[1].position_m[1] - 1.5).abs() < 1e-3 && ranges[1].offset_micros == 200, "{ranges:?}");
+    }
+
+    #[test]
+    fn what_is_amiss_is_named() {
+        for (fields, named) in [
+            (r#""points_m":[1,2,3,4]"#, "three a point"),
+            (r#""points_m":[1,2,1e5]"#, "beyond"),
+            (r#""points_m":[1,2,1e39]"#, "out of range"),
+            (r#""points_m":[1,2,null]"#, "null"),
+            (r#""points_m":[1,2,3],"ranges_m":[1]"#, "not both"),
+            (r#""rings":[]"#, "points_m or ranges_m"),
+            (r#""points_m":[1,2,3],"rings":[1,2]"#, "rings has 2"),
+            (r#""points_m":[1,2,3],"rings":[70000]"#, "70000"),
+            (r#""points_m":[1,2,3],"offsets_micros":[]"#, "offsets_micros has 0"),
+            (r#""ranges_m":[1],"step_rad":0.1"#, "first_rad"),
+            (r#""ranges_m":[1],"first_rad":0,"step_rad":1e9"#, "step_rad"),
+            (r#""ranges_m":[-1],"first_rad":0,"step_rad":0.1"#, "outside"),
+            (r#""points_m":[],"parts":0"#, "parts"),
+            (r#""points_m":[],"parts":65"#, "parts"),
+            (r#""points_m":[],"part":2,"parts":2"#, "part is 2"),
+            (r#""points_m":[],"seq":2"#, "duplicate"),
+        ] {
+            let told = refused_scan(fields);
+            assert!(told.contains(named), "{fields}: {told}");
+        }
+        let other = String::from_utf8(encode_pose(&pose())).expect("text");
+        for (from, to, named) in [
+            (r#""version":1"#, r#""version":2"#, "version 2"),
+            (r#""kind":"base""#, r#""kind":"range""#, "base"),
+            (r#""clock":"device""#, r#""clock":"sundial""#, "sundial"),
+            (r#""stamp_nanos":"#, r#""stamp_nanos":1e99,"x":"#, "floating point"),
+            (r#""quat_xyzw":["#, r#""quat_xyzw":[0,0,0,0],"x":["#, "length 1"),
+            (r#""xyz_m":["#, r#""xyz_m":[0,-1e300,0],"x":["#, "beyond"),
+        ] {
+            assert!(other.contains(from), "{from}");
+            let told = decode_pose(other.replace(from, to).as_bytes()).expect_err(to).to_string();
+            assert!(told.contains(named), "{to}: {told}");
+        }
+    }
+
+    #[test]
+    fn a_senders_text_does_not_flood_the_log() {
+        let long = format!(r#""a\n{}""#, "b".repeat(50_000));
+        let text = String::from_utf8(encode_pose(&pose())).expect("text").replace(r#""device""#, &long);
+        let told = decode_pose(text.as_bytes()).expect_err("no such clock").to_string();
+        assert!(told.contains("unknown variant `a?b") && told.len() <= MAX_TOLD, "{told}");
+    }
+
+    #[test]
+    fn cut_bent_and_random_bytes_never_panic() {
+        for whole in [encode_scan(&part()), encode_pose(&pose())] {
+            for end in 0..whole.len() {
+                assert!(decode_scan(&whole[..end]).is_err() && decode_pose(&whole[..end]).is_err(), "{end}");
+            }
+            for ix in 0..8 * whole.len() {
+                let mut bent = whole.clone();
+                bent[ix / 8] ^= 1 << (ix % 8);
+                let _ = (decode_scan(&bent), decode_pose(&bent));
+            }
+        }
+        let mut state = 1_u64;
+        let mut random = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            state.to_be_bytes()[0]
+        };
+        for len in 0..2000 {
+            let bytes: Vec<u8> = (0..len % 300).map(|_| random()).collect();
+            assert!(decode_scan(&bytes).is_err() && decode_pose(&bytes).is_err());
+        }
+        let deep = "[".repeat(60_000);
+        assert!(decode_scan(format!(r#"{{"kind":"range","version":1,"points_m":{deep}"#).as_bytes()).is_err());
+    }
+}
