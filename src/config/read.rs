@@ -5,6 +5,7 @@ use super::{
     Arm, ArmDriver, Base, BaseDriver, Camera, CameraDriver, CameraSim, ConfigError, Depth, JoinConfig, MAX_BYTES,
     MAX_SPLATS, Measured, Override, Parent, Rig, SEED, Scanner, ScannerDriver, ScannerSim, Sim, Train, USUAL_SEED,
 };
+use crate::method::Kind;
 use kinematics::{Chain, Intrinsics, Lens, Transform};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use toml::{Table, Value};
@@ -28,7 +29,7 @@ pub(super) const SCANNER_DRIVERS: [(&str, ScannerDriver); 2] =
     [("udp", ScannerDriver::Udp), ("sim", ScannerDriver::Sim)];
 pub(super) const PARENTS: [(&str, Parent); 3] =
     [("flange", Parent::Flange), ("base", Parent::Base), ("world", Parent::World)];
-const METHODS: [(&str, &str); 3] = [("splat", "splat"), ("nerf", "nerf"), ("tsdf", "tsdf")];
+const METHODS: [(&str, Kind); 3] = [("splat", Kind::Splat), ("nerf", Kind::Nerf), ("tsdf", Kind::Tsdf)];
 /// Poses and lens coefficients beyond this are slips of the pen.
 const FAR: f64 = 1e4;
 /// Offsets of joints beyond this, rad or m, are not offsets.
@@ -364,7 +365,7 @@ fn join(mut keys: Section<'_>) -> JoinConfig {
 
 fn train(mut keys: Section<'_>) -> Train {
     let train = Train {
-        method: keys.choice("method", &METHODS).unwrap_or("splat").to_owned(),
+        methods: keys.choices("method", &METHODS).unwrap_or_else(|| vec![Kind::Splat]),
         max_splats: keys.whole("max_splats", MAX_SPLATS),
         max_bytes: keys.whole("max_bytes", MAX_BYTES),
         seed: keys.whole("seed", SEED).unwrap_or(USUAL_SEED),
