@@ -127,7 +127,9 @@ fn made_with<T: serde::de::DeserializeOwned>(checkpoint: &Checkpoint) -> anyhow:
 }
 
 /// The kind of model that a folder holds: what its `model.json` names, else what its files are; `None` where there is neither.
+/// A folder that holds several models is refused.
 pub(crate) fn kind_in(folder: &Path) -> anyhow::Result<Option<Kind>> {
+    expect_one_model(folder)?;
     #[derive(serde::Deserialize)]
     struct About {
         method: Option<String>,
@@ -142,7 +144,6 @@ pub(crate) fn kind_in(folder: &Path) -> anyhow::Result<Option<Kind>> {
 
 /// A saved model: its folder, of any kind, or a file of splats.
 pub(crate) fn load(gpu: Arc<Gpu>, model: &Path) -> anyhow::Result<Box<dyn Method>> {
-    expect_one_model(model)?;
     match kind_in(model)? {
         Some(Kind::Tsdf) => return Ok(Box::new(Aligned::of_folder(TsdfModel::load(gpu, model)?, model)?)),
         Some(Kind::Nerf) => return Ok(Box::new(Aligned::of_folder(NerfModel::load(gpu, model)?, model)?)),

@@ -58,7 +58,8 @@ pub(crate) struct Args {
     /// Address of the page, as numbers
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:7007", value_parser = address)]
     listen: SocketAddr,
-    /// Where the results and the settled rig file go; a folder that holds a model is refused [default: a new folder in runs]
+    /// Where the results and the settled rig file go, of several methods in a folder each inside; a folder that holds a model is
+    /// refused [default: a new folder in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
     #[command(flatten)]

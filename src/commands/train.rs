@@ -56,7 +56,7 @@ pub(crate) struct Args {
     /// Weights of LPIPS for `SqueezeNet` (safetensors) [default: what `FIELDRIG_LPIPS_WEIGHTS` names; none: no LPIPS]
     #[arg(long, value_name = "FILE")]
     lpips_weights: Option<PathBuf>,
-    /// Where the results go; a folder that holds a model is refused [default: the folder of --resume if it holds none, else a new one in runs]
+    /// Where the results go, of several methods in a folder each inside; a folder that holds a model is refused [default: the folder of --resume if it holds none, else a new one in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
     /// Write the recording's rig file here with what was found about its cameras, and the robot's description (robot.urdf) beside it
