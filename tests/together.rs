@@ -7,7 +7,7 @@ use std::process::{Command, Output};
 
 const N_PHOTOS: u32 = 10;
 const SIZE_PX: [u32; 2] = [48, 36];
-/// Steps of each method; the distance field is done after the seven images it may see.
+/// Steps of each method; the distance field is done after the eight images it may see.
 const N_STEPS: &str = "24";
 
 /// A nerfstudio folder with depth: a camera slides along a colorful wall, 1 m away from it.
@@ -87,7 +87,7 @@ fn each_of_several_methods_ends_with_the_bits_that_it_has_alone() {
         });
         assert!(!log.is_empty() && log == log_alone, "{method}: {log:?}");
     }
-    assert_eq!(together[0]["steps"], json!(7), "the distance field has seen all");
+    assert_eq!(together[0]["steps"], json!(8), "the distance field has seen all");
 
     goes_on_method_by_method(folder, together[1]);
     exports_meshes(folder);
@@ -123,7 +123,7 @@ fn exports_meshes(folder: &Path) {
     refused(folder, &["export", "all/tsdf", "--to", "spz", "--out", "a.spz"], &["which has no splats"]);
     refused(folder, &["export", "all/tsdf", "--to", "glb", "--out", "whole.glb"], &["it is there already"]);
     refused(folder, &["export", "all/tsdf", "--to", "glb", "--out", "a.ply"], &["ends in .glb"]);
-    refused(folder, &["export", "all/tsdf", "--to", "glb", "--out", "a.glb", "--cell-m", "-1"], &["--cell-m"]);
+    refused(folder, &["export", "all/tsdf", "--to", "glb", "--out", "a.glb", "--cell-m", "0"], &["--cell-m"]);
     refused(folder, &["export", "all/nerf", "--to", "glb", "--out", "a.glb"], &["neither splats nor a mesh"]);
     refused(folder, &["export", "all", "--to", "glb", "--out", "a.glb"], &["all/splat or all/tsdf or all/nerf"]);
 }
