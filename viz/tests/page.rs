@@ -25,17 +25,19 @@ fn is_accent([red, green, blue]: [u8; 3]) -> bool {
     green >= red.saturating_add(30) && blue >= red.saturating_add(18)
 }
 
+/// A request, and the model that it is for.
+type Asked = (RenderRequest, Option<String>);
+
 /// Draws requests on its own thread and keeps them, as a training thread would serve them.
 struct Painter {
-    /// What was asked for, and of which model.
-    asked: Arc<Mutex<Vec<(RenderRequest, Option<String>)>>>,
+    asked: Arc<Mutex<Vec<Asked>>>,
     stop: Arc<AtomicBool>,
     thread: Option<std::thread::JoinHandle<()>>,
 }
 
 impl Painter {
     fn start(hub: Hub) -> Self {
-        let asked: Arc<Mutex<Vec<(RenderRequest, Option<String>)>>> = Arc::default();
+        let asked: Arc<Mutex<Vec<Asked>>> = Arc::default();
         let stop: Arc<AtomicBool> = Arc::default();
         let (seen, stopped) = (Arc::clone(&asked), Arc::clone(&stop));
         let thread = std::thread::spawn(move || {
