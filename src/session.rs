@@ -179,19 +179,16 @@ pub(crate) struct Ending<P> {
     pub(crate) particulars: P,
 }
 
-/// What is known of a model once it is saved.
-struct Saved {
-    seconds: f64,
-    checkpoint_sha256: String,
-}
-
 /// Saves the models; then scores each a last time, writes its report, and tells the end.
 pub(crate) fn finish(mut endings: Vec<Ending<impl Serialize>>) -> anyhow::Result<()> {
     // Saved before any is scored: a second Ctrl-C during the scoring loses nothing.
-    let saved: Vec<Saved> =
-        endings.iter_mut().map(|ending| ending.session.save(&ending.out)).collect::<anyhow::Result<_>>()?;
-    for (Ending { session, out, particulars }, saved) in endings.into_iter().zip(saved) {
-        session.tell_end(&out, &saved, &particulars)?;
+    let ended_secs: Vec<f64> = endings.iter_mut().map(|ending| ending.session.halt()).collect::<anyhow::Result<_>>()?;
+    let mut hashes = Vec::new();
+    for (Ending { session, out, .. }, seconds) in endings.iter_mut().zip(&ended_secs) {
+        hashes.push(session.save(out, *seconds)?);
+    }
+    for ((Ending { session, out, particulars }, seconds), hash) in endings.into_iter().zip(ended_secs).zip(hashes) {
+        session.tell_end(&out, seconds, &hash, &particulars)?;
     }
     Ok(())
 }
@@ -447,9 +444,8 @@ impl Session {
         self.method.progress()
     }
 
-    /// Ends training and saves the model.
-    fn save(&mut self, out: &Path) -> anyhow::Result<Saved> {
-        let seconds = self.halt()?;
+    /// Saves the model after so many seconds of training; its hash comes back.
+    fn save(&mut self, out: &Path, seconds: f64) -> anyhow::Result<String> {
         if let Some(decisions) = self.decisions.take()
             && let Err(error) = decisions.end(self.method.n_taken()?)
         {
@@ -462,13 +458,17 @@ impl Session {
         if let Some(checkpoints) = &mut self.checkpoints {
             checkpoints.begin(self.method.as_mut(), seconds)?;
         }
-        Ok(Saved { seconds, checkpoint_sha256: run_folder::checkpoint_sha256(out)? })
+        run_folder::checkpoint_sha256(out)
     }
 
     /// Scores the saved model a last time, writes the report, and tells the end.
-    fn tell_end(mut self, out: &Path, saved: &Saved, particulars: &impl Serialize) -> anyhow::Result<()> {
-        let Saved { seconds, checkpoint_sha256 } = saved;
-        let seconds = *seconds;
+    fn tell_end(
+        mut self,
+        out: &Path,
+        seconds: f64,
+        checkpoint_sha256: &str,
+        particulars: &impl Serialize,
+    ) -> anyhow::Result<()> {
         let outcome = self.score_at_end(seconds)?;
         let done = Done {
             event: "done",
