@@ -1,14 +1,12 @@
 //! Checkpoints of a model in training: taken every so often, written on a thread of their own.
 
+use crate::run_folder::{CHECKPOINT, expect_one_model};
 use anyhow::Context;
 use std::path::{Path, PathBuf};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use trainer::Method;
 use trainer::checkpoint::{Checkpoint, PendingCheckpoint};
-
-/// Name of the checkpoint in the folder of a run.
-const FILE: &str = "training.ckpt";
 
 /// How often checkpoints are written.
 #[derive(Clone, Copy, Debug, clap::Args)]
@@ -25,7 +23,8 @@ fn secs(text: &str) -> Result<Duration, String> {
 
 /// Reads the checkpoint in the folder of a run.
 pub(crate) fn read(folder: &Path) -> anyhow::Result<Checkpoint> {
-    Checkpoint::read(&folder.join(FILE)).with_context(|| format!("nothing to go on from in {}", folder.display()))
+    expect_one_model(folder)?;
+    Checkpoint::read(&folder.join(CHECKPOINT)).with_context(|| format!("nothing to go on from in {}", folder.display()))
 }
 
 /// The checkpoints of one run; each replaces the one before.
@@ -40,7 +39,7 @@ impl Checkpoints {
     /// None where they are not wanted. The first is due after the time between two.
     pub(crate) fn new(folder: &Path, args: CheckpointArgs) -> Option<Self> {
         let every = args.checkpoint_secs;
-        (!every.is_zero()).then(|| Self { path: folder.join(FILE), every, last: Instant::now(), writing: None })
+        (!every.is_zero()).then(|| Self { path: folder.join(CHECKPOINT), every, last: Instant::now(), writing: None })
     }
 
     /// Begins one when it is due and the one before is written, and says so. A disk that refuses one does not stop training.
@@ -103,6 +102,6 @@ mod tests {
     fn a_folder_without_a_checkpoint_is_named() {
         let folder = tempfile::tempdir().expect("a folder");
         let told = format!("{:#}", read(folder.path()).expect_err("none"));
-        assert!(told.contains(folder.path().to_str().expect("plain")) && told.contains(FILE), "{told}");
+        assert!(told.contains(folder.path().to_str().expect("plain")) && told.contains(CHECKPOINT), "{told}");
     }
 }

@@ -141,6 +141,11 @@ impl Data {
         self.keyframes.iter().filter(|keyframe| keyframe.split == split).cloned().collect()
     }
 
+    /// Whether any keyframe has depth.
+    pub(crate) fn has_depth(&self) -> bool {
+        self.keyframes.iter().any(|keyframe| keyframe.depth.is_some())
+    }
+
     fn from_folder(
         path: &Path,
         holdout: &Holdout,

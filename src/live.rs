@@ -1,12 +1,13 @@
-//! A model growing while keyframes come in and people look.
+//! Models growing while keyframes come in and people look.
 
 use crate::feed::{Change, Feed, Leftover};
 use crate::scene_hint;
 use crate::session::Session;
+use crate::turns;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::{Keyframe, Split};
-use viz::{Hub, KeyframePose, Status};
+use viz::{Hub, KeyframePose, ModelStatus, Status};
 
 /// The status is told this often.
 const PUBLISH_EVERY: Duration = Duration::from_millis(250);
@@ -31,15 +32,15 @@ pub(crate) enum Pace {
 
 /// The moving parts of a run.
 pub(crate) struct Live {
-    pub(crate) session: Session,
+    /// The first is what people see who do not say which.
+    sessions: Vec<Session>,
     feed: Feed,
     hub: Hub,
     pace: Pace,
-    method_name: &'static str,
     start_keyframes: usize,
     keyframes: Vec<Arc<Keyframe>>,
-    /// Step at which the next keyframe is due in lockstep.
-    next_keyframe_at: u64,
+    /// Step of each session at which the next keyframe is due in lockstep.
+    next_keyframe_at: Vec<u64>,
     trained: Duration,
     published: Option<Instant>,
     scoring: Duration,
@@ -48,16 +49,15 @@ pub(crate) struct Live {
 
 impl Live {
     /// Puts the parts together; nothing happens yet.
-    pub(crate) fn new(session: Session, feed: Feed, hub: Hub, options: LiveOptions) -> Self {
+    pub(crate) fn new(sessions: Vec<Session>, feed: Feed, hub: Hub, options: LiveOptions) -> Self {
         Self {
-            session,
+            next_keyframe_at: vec![0; sessions.len()],
+            sessions,
             feed,
             hub,
             pace: options.pace,
-            method_name: options.method_name,
             start_keyframes: options.start_keyframes,
             keyframes: Vec::new(),
-            next_keyframe_at: 0,
             trained: Duration::ZERO,
             published: None,
             scoring: Duration::ZERO,
@@ -67,7 +67,10 @@ impl Live {
 
     /// Whether a limit was reached, the devices failed, or they ended and left nothing to train on.
     pub(crate) fn is_over(&self) -> bool {
-        self.session.is_over() || self.feed.broke_off() || (self.feed.ended() && !self.can_train())
+        // Where one reached its limit, the others are waited for as long as they can reach theirs.
+        let is_done = |session: &Session| session.is_over() || (self.feed.ended() && session.is_idle());
+        let reached = self.sessions.iter().any(Session::is_over) && self.sessions.iter().all(is_done);
+        reached || self.feed.broke_off() || (self.feed.ended() && !self.can_train())
     }
 
     /// Keyframes held, in order of acceptance.
@@ -78,24 +81,25 @@ impl Live {
     /// Gives new keyframes to the model: all that wait in real time, the one that is due in lockstep.
     pub(crate) fn take_keyframes(&mut self) -> anyhow::Result<()> {
         if let Some(first_image) = self.feed.first_image() {
-            self.session.start_clock(first_image);
+            self.sessions.iter_mut().for_each(|session| session.start_clock(first_image));
         }
         let n_before = self.keyframes.len();
         match self.pace {
             Pace::RealTime => {
-                let patience = if self.is_training() && !self.session.is_idle() { Duration::ZERO } else { IDLE };
+                let patience = if self.is_training() && !self.is_idle() { Duration::ZERO } else { IDLE };
                 while let Some(change) = self.feed.next(patience) {
                     self.apply(change)?;
                 }
             }
             Pace::Lockstep { steps_per_keyframe } => {
-                let step = self.session.progress().step;
-                while !self.feed.ended() && (step >= self.next_keyframe_at || self.session.is_idle()) {
+                while !self.feed.ended() && self.is_keyframe_due() {
                     let Some(change) = self.feed.next(IDLE) else { break };
                     let is_new = matches!(change, Change::Accepted(_));
                     self.apply(change)?;
                     if is_new && self.is_training() {
-                        self.next_keyframe_at = step + steps_per_keyframe;
+                        for (at, session) in self.next_keyframe_at.iter_mut().zip(&self.sessions) {
+                            *at = session.progress().step + steps_per_keyframe;
+                        }
                     }
                 }
             }
@@ -117,20 +121,18 @@ impl Live {
         if !self.is_training() {
             return Ok(());
         }
-        let n_most = match self.pace {
-            Pace::RealTime => u64::MAX,
-            Pace::Lockstep { .. } if self.feed.ended() => u64::MAX,
-            Pace::Lockstep { .. } => self.next_keyframe_at.saturating_sub(self.session.progress().step),
-        };
-        if n_most == 0 {
-            return Ok(());
-        }
         if self.is_finished() {
             std::thread::sleep(IDLE);
             return Ok(());
         }
+        let is_paced = self.pace != Pace::RealTime && !self.feed.ended();
+        let due = &self.next_keyframe_at;
+        let n_most = |ix: usize, session: &Session| match is_paced {
+            true => due[ix].saturating_sub(session.progress().step),
+            false => u64::MAX,
+        };
         let before = Instant::now();
-        self.session.step(n_most)?;
+        turns::take(&mut self.sessions, n_most)?;
         self.trained = before.elapsed();
         Ok(())
     }
@@ -145,7 +147,13 @@ impl Live {
                 pending.fail("nothing was seen yet");
                 continue;
             }
-            match self.session.render(&pending.request) {
+            let Some(session) = of_method(&mut self.sessions, pending.method()) else {
+                let there = self.sessions.iter().map(|session| session.kind().name()).collect::<Vec<_>>().join(", ");
+                let asked = pending.method().unwrap_or_default().to_owned();
+                pending.fail(&format!("no model of the method {asked:?} learns here, but {there}"));
+                continue;
+            };
+            match session.render(&pending.request) {
                 Ok(picture) => pending.deliver(picture),
                 Err(error) => pending.fail(&error.to_string()),
             }
@@ -158,37 +166,39 @@ impl Live {
             return Ok(());
         }
         self.published = Some(Instant::now());
-        let progress = self.session.progress();
-        if progress.step > 0 && self.scoring.as_secs_f64() < SCORE_FRAC * self.session.secs() {
+        let clock_secs = self.sessions[0].secs();
+        if self.scoring.as_secs_f64() < SCORE_FRAC * clock_secs {
             let before = Instant::now();
-            self.session.refresh_psnr()?;
+            for session in self.sessions.iter_mut().filter(|session| session.progress().step > 0) {
+                session.refresh_psnr()?;
+            }
             self.scoring += before.elapsed();
         }
+        let mut models = self.sessions.iter().map(model_status);
         self.hub.set_status(Status {
             state: self.state().to_owned(),
-            method: self.method_name.to_owned(),
-            seconds: self.session.secs(),
-            step: progress.step,
-            step_millis: (progress.step > 0).then_some(progress.step_millis),
-            primitives: progress.primitives,
-            bytes: progress.bytes,
+            seconds: clock_secs,
             keyframes: self.keyframes.len() as u64,
             refused: self.feed.refused(),
-            psnr: self.session.psnr(),
-            psnr_history: self.session.psnr_history().to_vec(),
+            model: models.next().unwrap_or_default(),
+            others: models.collect(),
             notes: self.notes.clone(),
         });
         Ok(())
     }
 
-    /// Ends the input; the session and what is left of the input come back.
-    pub(crate) fn finish(self) -> (Session, anyhow::Result<Leftover>) {
+    /// Ends the input; the sessions and what is left of the input come back.
+    pub(crate) fn finish(self) -> (Vec<Session>, anyhow::Result<Leftover>) {
+        let name =
+            |session: &Session| ModelStatus { method: session.kind().name().to_owned(), ..ModelStatus::default() };
+        let mut models = self.sessions.iter().map(name);
         self.hub.set_status(Status {
             state: "saving".to_owned(),
-            method: self.method_name.to_owned(),
+            model: models.next().unwrap_or_default(),
+            others: models.collect(),
             ..Status::default()
         });
-        (self.session, self.feed.finish())
+        (self.sessions, self.feed.finish())
     }
 
     fn is_training(&self) -> bool {
@@ -200,9 +210,22 @@ impl Live {
         self.keyframes.iter().any(|keyframe| keyframe.split == Split::Train)
     }
 
-    /// Whether the model knows all there is to know; it is shown until somebody ends the run.
+    /// Whether no model can learn before a keyframe comes.
+    fn is_idle(&self) -> bool {
+        self.sessions.iter().all(|session| session.is_idle() || session.has_all_steps())
+    }
+
+    /// Whether each model came to the step at which the next keyframe is due, or can do nothing without it.
+    fn is_keyframe_due(&self) -> bool {
+        let is_due = |(session, at): (&Session, &u64)| {
+            session.progress().step >= *at || session.is_idle() || session.has_all_steps()
+        };
+        self.sessions.iter().zip(&self.next_keyframe_at).all(is_due)
+    }
+
+    /// Whether the models know all there is to know; they are shown until somebody ends the run.
     fn is_finished(&self) -> bool {
-        self.feed.ended() && self.session.is_idle()
+        self.feed.ended() && self.is_idle()
     }
 
     fn state(&self) -> &'static str {
@@ -220,11 +243,16 @@ impl Live {
     fn apply(&mut self, change: Change) -> anyhow::Result<()> {
         match change {
             Change::Accepted(keyframe) => {
-                self.session.push(&keyframe)?;
+                // Nothing comes to a model that has made all its steps: it is as it would be alone.
+                for session in self.sessions.iter_mut().filter(|session| !session.has_all_steps()) {
+                    session.push(&keyframe)?;
+                }
                 self.keyframes.push(keyframe);
             }
             Change::Evicted { camera, stamp } => {
-                self.session.remove(&camera, stamp)?;
+                for session in self.sessions.iter_mut().filter(|session| !session.has_all_steps()) {
+                    session.remove(&camera, stamp)?;
+                }
                 self.keyframes.retain(|keyframe| keyframe.camera != camera || keyframe.stamp != stamp);
             }
         }
@@ -236,12 +264,28 @@ impl Live {
 pub(crate) struct LiveOptions {
     /// What sets the pace.
     pub(crate) pace: Pace,
-    /// Name of the scene model.
-    pub(crate) method_name: &'static str,
     /// Keyframes with which training starts.
     pub(crate) start_keyframes: usize,
     /// Sentences for the page.
     pub(crate) notes: Vec<String>,
+}
+
+/// The session of a method; the first where none is named.
+fn of_method<'a>(sessions: &'a mut [Session], method: Option<&str>) -> Option<&'a mut Session> {
+    sessions.iter_mut().find(|session| method.is_none_or(|name| session.kind().name() == name))
+}
+
+fn model_status(session: &Session) -> ModelStatus {
+    let progress = session.progress();
+    ModelStatus {
+        method: session.kind().name().to_owned(),
+        step: progress.step,
+        step_millis: (progress.step > 0).then_some(progress.step_millis),
+        primitives: progress.primitives,
+        bytes: progress.bytes,
+        psnr: session.psnr(),
+        psnr_history: session.psnr_history().to_vec(),
+    }
 }
 
 fn frustum(keyframe: &Keyframe) -> KeyframePose {

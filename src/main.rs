@@ -5,6 +5,7 @@ mod camera_path;
 mod chart;
 mod checkpoints;
 mod cli;
+mod clock;
 mod commands;
 mod config;
 mod corrected_rig;
@@ -32,6 +33,7 @@ mod splat_file;
 mod stop;
 mod training;
 mod training_args;
+mod turns;
 
 use clap::Parser;
 use std::io::Write;

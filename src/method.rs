@@ -1,7 +1,8 @@
 //! Which scene model: by its name on the command line, new or out of a folder.
 
-use crate::config::{Rig, Train};
+use crate::config::Train;
 use crate::exit::BadArgument;
+use crate::run_folder::expect_one_model;
 use crate::splat_file;
 use anyhow::Context;
 use std::path::Path;
@@ -14,7 +15,7 @@ use trainer::tsdf::{TsdfModel, TsdfOptions};
 use trainer::{Aligned, Keyframe, Method, Renewable};
 
 /// The scene models there are.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Kind {
     /// 3D Gaussians.
     Splat,
@@ -25,16 +26,12 @@ pub(crate) enum Kind {
 }
 
 impl Kind {
-    /// The kind that a rig file names.
-    pub(crate) fn of_rig(rig: &Rig) -> Result<Self, BadArgument> {
-        let name = &rig.train.method;
-        Self::named(name)
-            .ok_or_else(|| BadArgument(format!("train.method = {name:?}: must be \"splat\", \"nerf\" or \"tsdf\"")))
-    }
+    /// All there are.
+    pub(crate) const ALL: [Self; 3] = [Self::Splat, Self::Tsdf, Self::Nerf];
 
     /// The kind of a name.
     pub(crate) fn named(name: &str) -> Option<Self> {
-        clap::ValueEnum::from_str(name, false).ok()
+        Self::ALL.into_iter().find(|kind| kind.name() == name)
     }
 
     /// Its name in files and on the command line.
@@ -45,14 +42,33 @@ impl Kind {
             Self::Nerf => "nerf",
         }
     }
+}
 
+/// Names of kinds for people: `splat`, `tsdf and splat`, `tsdf, nerf and splat`.
+pub(crate) fn in_words(kinds: &[Kind]) -> String {
+    let names: Vec<&str> = kinds.iter().map(|kind| kind.name()).collect();
+    match names.split_last() {
+        Some((last, others)) if !others.is_empty() => format!("{} and {last}", others.join(", ")),
+        _ => names.concat(),
+    }
+}
+
+/// A scene model to be made.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Recipe {
+    pub(crate) kind: Kind,
+    pub(crate) options: SplatOptions,
+}
+
+impl Recipe {
     /// A model that has seen nothing yet. Of the options a distance field has the memory it may take, a neural field also
     /// seed, planned steps and whether poses of images are learned, and both alignment; what else they want to know they find in the keyframes.
-    pub(crate) fn start(self, gpu: Arc<Gpu>, options: SplatOptions) -> anyhow::Result<Box<dyn Method>> {
-        Ok(match self {
-            Self::Splat => Box::new(SplatTrainer::new(gpu, options)?),
-            Self::Tsdf => aligned(TsdfModel::new(gpu.clone(), tsdf_options(&options))?, &gpu, options),
-            Self::Nerf => aligned(NerfModel::new(gpu.clone(), nerf_options(&options))?, &gpu, options),
+    pub(crate) fn start(self, gpu: Arc<Gpu>) -> anyhow::Result<Box<dyn Method>> {
+        let Self { kind, options } = self;
+        Ok(match kind {
+            Kind::Splat => Box::new(SplatTrainer::new(gpu, options)?),
+            Kind::Tsdf => aligned(TsdfModel::new(gpu.clone(), tsdf_options(&options))?, &gpu, options),
+            Kind::Nerf => aligned(NerfModel::new(gpu.clone(), nerf_options(&options))?, &gpu, options),
         })
     }
 }
@@ -76,10 +92,9 @@ fn nerf_options(options: &SplatOptions) -> NerfOptions {
 
 /// A model that goes on from a checkpoint.
 pub(crate) struct Resumed {
-    pub(crate) kind: Kind,
-    pub(crate) method: Box<dyn Method>,
     /// Seed and planned steps are those that training began with.
-    pub(crate) options: SplatOptions,
+    pub(crate) recipe: Recipe,
+    pub(crate) method: Box<dyn Method>,
     /// What it had not learned from: test keyframes, and new ones.
     pub(crate) rest: Vec<Arc<Keyframe>>,
 }
@@ -91,18 +106,18 @@ pub(crate) fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Ke
         let options = SplatOptions { max_bytes, ..SplatOptions::default() };
         let resume = |own: &Checkpoint, keyframes: &[_]| TsdfModel::resume(gpu, own, keyframes);
         let (method, rest) = Aligned::resume(checkpoint, keyframes, resume)?;
-        return Ok(Resumed { kind: Kind::Tsdf, method, options, rest });
+        return Ok(Resumed { recipe: Recipe { kind: Kind::Tsdf, options }, method, rest });
     }
     if checkpoint.method == Kind::Nerf.name() {
         let NerfOptions { seed, max_bytes, n_planned_steps, cameras, .. } = made_with(checkpoint)?;
         let options = SplatOptions { seed, max_bytes, n_planned_steps, cameras, ..SplatOptions::default() };
         let resume = |own: &Checkpoint, keyframes: &[_]| NerfModel::resume(gpu, own, keyframes);
         let (method, rest) = Aligned::resume(checkpoint, keyframes, resume)?;
-        return Ok(Resumed { kind: Kind::Nerf, method, options, rest });
+        return Ok(Resumed { recipe: Recipe { kind: Kind::Nerf, options }, method, rest });
     }
     let (model, rest) = SplatTrainer::resume(gpu, checkpoint, keyframes)?;
-    let options = model.options().clone();
-    Ok(Resumed { kind: Kind::Splat, method: Box::new(model), options, rest })
+    let recipe = Recipe { kind: Kind::Splat, options: model.options().clone() };
+    Ok(Resumed { recipe, method: Box::new(model), rest })
 }
 
 /// The options of the model that a checkpoint is of.
@@ -112,7 +127,9 @@ fn made_with<T: serde::de::DeserializeOwned>(checkpoint: &Checkpoint) -> anyhow:
 }
 
 /// The kind of model that a folder holds: what its `model.json` names, else what its files are; `None` where there is neither.
+/// A folder that holds several models is refused.
 pub(crate) fn kind_in(folder: &Path) -> anyhow::Result<Option<Kind>> {
+    expect_one_model(folder)?;
     #[derive(serde::Deserialize)]
     struct About {
         method: Option<String>,

@@ -5,7 +5,7 @@ use crate::data::Data;
 use crate::decisions::{Decision, Decisions};
 use crate::exit::{BadArgument, LackOfEvidence};
 use crate::join::KeyframeList;
-use crate::method::Kind;
+use crate::method::{Kind, Recipe};
 use crate::session::Session;
 use crate::stop::Stop;
 use kinematics::Stamp;
@@ -19,7 +19,7 @@ use trainer::Keyframe;
 pub(crate) struct Replay {
     path: PathBuf,
     pub(crate) decisions: Decisions,
-    pub(crate) kind: Kind,
+    kind: Kind,
 }
 
 impl Replay {
@@ -84,6 +84,11 @@ impl Replay {
         }
     }
 
+    /// The scene model that it is of.
+    pub(crate) fn recipe(&self) -> Recipe {
+        Recipe { kind: self.kind, options: self.decisions.settings.options.clone() }
+    }
+
     /// Says where the bits may differ.
     pub(crate) fn check_adapter(&self, adapter: &str) {
         let then = &self.decisions.settings.adapter;
@@ -93,12 +98,7 @@ impl Replay {
     }
 
     /// Repeats the decisions, each at its step.
-    pub(crate) fn drive(
-        &self,
-        mut session: Session,
-        keyframes: &[Arc<Keyframe>],
-        stop: &Stop,
-    ) -> anyhow::Result<Session> {
+    pub(crate) fn drive(&self, session: &mut Session, keyframes: &[Arc<Keyframe>], stop: &Stop) -> anyhow::Result<()> {
         let there = by_name(keyframes);
         session.start_clock(Instant::now());
         for entry in &self.decisions.entries {
@@ -131,7 +131,7 @@ impl Replay {
                 Decision::Had(_) | Decision::Checkpoint(_) | Decision::End(_) => {}
             }
         }
-        Ok(session)
+        Ok(())
     }
 
     /// The settings as keys of a rig file, so that the settled one that is written tells the truth.

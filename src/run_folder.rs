@@ -1,6 +1,8 @@
 //! Where the results of a run go, and what its report says.
 
+use crate::config::Rig;
 use crate::exit::BadArgument;
+use crate::method::Kind;
 use anyhow::{Context, ensure};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
@@ -13,19 +15,59 @@ use trainer::{Keyframe, Method};
 const MODEL_FILES: [&str; 6] = ["model.json", "mesh.ply", "mesh.glb", "field.blocks", "field.nerf", "splats.ply"];
 /// Where a model lies until it is whole.
 const UNFINISHED: &str = "model.part";
+/// What training needs to go on, in the folder of a run.
+pub(crate) const CHECKPOINT: &str = "training.ckpt";
 /// Held while a run writes into a folder.
 const LOCK: &str = ".lock";
 const SECS_PER_DAY: u64 = 86_400;
 
-/// Refuses a folder that holds a model: results of two runs never mix, and none is replaced.
+/// Refuses a folder that holds a model, or several: results of two runs never mix, and none is replaced.
 pub(crate) fn refuse_model(folder: &Path) -> Result<(), BadArgument> {
-    match MODEL_FILES.iter().find(|name| folder.join(name).exists()) {
-        Some(name) => Err(BadArgument(format!(
-            "--out {}: the folder holds a model already ({name}), name another one",
-            folder.display()
+    let places = [PathBuf::new()].into_iter().chain(Kind::ALL.map(|kind| PathBuf::from(kind.name())));
+    let mut files = places.flat_map(|place| MODEL_FILES.map(|name| place.join(name)));
+    match files.find(|file| folder.join(file).exists()) {
+        Some(file) => Err(BadArgument(format!(
+            "--out {}: the folder holds a model already ({}), name another one",
+            folder.display(),
+            file.display()
         ))),
         None => Ok(()),
     }
+}
+
+/// Refuses the folder of a run of several methods where one model is meant, and names theirs.
+pub(crate) fn expect_one_model(folder: &Path) -> Result<(), BadArgument> {
+    let holds_one = |folder: &Path| MODEL_FILES.iter().chain([&CHECKPOINT]).any(|name| folder.join(name).exists());
+    let inside: Vec<String> = Kind::ALL
+        .into_iter()
+        .map(|kind| folder.join(kind.name()))
+        .filter(|folder| holds_one(folder))
+        .map(|folder| folder.display().to_string())
+        .collect();
+    if inside.is_empty() || holds_one(folder) {
+        return Ok(());
+    }
+    Err(BadArgument(format!("{}: a folder for each method lies in it, name {}", folder.display(), inside.join(" or "))))
+}
+
+/// Makes the folder of each model of a run: the one asked for where there is one model, else one inside it by the name of its
+/// method. The settled rig file, where there is one, is written into each: beside a model the one that makes it alone.
+pub(crate) fn make_each(asked: Option<&Path>, kinds: &[Kind], rig: Option<&Rig>) -> anyhow::Result<Vec<PathBuf>> {
+    let write = |rig: &Rig, folder: &Path| {
+        rig.write_settled(folder).with_context(|| format!("cannot write into {}", folder.display()))
+    };
+    let out = make(asked)?;
+    let folders: Vec<PathBuf> = match kinds {
+        [_] => vec![out.clone()],
+        several => several.iter().map(|kind| make(Some(&out.join(kind.name())))).collect::<anyhow::Result<_>>()?,
+    };
+    if let Some(rig) = rig {
+        write(rig, &out)?;
+        for (kind, folder) in kinds.iter().zip(&folders) {
+            write(&rig.with_method(*kind), folder)?;
+        }
+    }
+    Ok(folders)
 }
 
 /// Makes the folder asked for, or `runs/<UTC time>`; one that holds a model is refused.
@@ -169,6 +211,22 @@ mod tests {
         std::fs::write(folder.path().join("model.json"), b"{}").expect("file");
         let told = make(Some(folder.path())).expect_err("a model").to_string();
         assert!(told.contains(folder.path().to_str().expect("plain")) && told.contains("model.json"), "{told}");
+    }
+
+    #[test]
+    fn several_models_lie_in_folders_of_their_own_and_are_found() {
+        let folder = tempfile::tempdir().expect("folder");
+        let asked = folder.path().join("out");
+        let made = make_each(Some(&asked), &[Kind::Tsdf, Kind::Splat], None).expect("it is free");
+        assert_eq!(made, [asked.join("tsdf"), asked.join("splat")]);
+        expect_one_model(&asked).expect("there is none yet");
+        std::fs::write(made[0].join(CHECKPOINT), b"{}").expect("file");
+        std::fs::write(made[1].join("splats.ply"), b"{}").expect("file");
+        let told = expect_one_model(&asked).expect_err("two").0;
+        assert!(told.contains("out/splat or ") && told.ends_with("out/tsdf"), "{told}");
+        expect_one_model(&made[1]).expect("one");
+        let told = refuse_model(&asked).expect_err("one inside").0;
+        assert!(told.contains("splat/splats.ply"), "{told}");
     }
 
     #[test]

@@ -1,15 +1,18 @@
-//! One model in training: its test keyframes, its clock, and what is told of it.
+//! One model in training: its keyframes, its clock, and what is told of it.
 
 use crate::bench::statistics::median;
 use crate::checkpoints::Checkpoints;
+use crate::clock::Clock;
 use crate::decisions::DecisionLog;
 use crate::evaluate::{Evaluator, ImageScores, Scores};
 use crate::marks::Marks;
+use crate::method::Kind;
+use crate::turns::TURN;
 use crate::{print, run_folder};
 use indicatif::ProgressBar;
 use serde::Serialize;
 use std::collections::{BTreeMap, VecDeque};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::align::Alignment;
@@ -42,6 +45,7 @@ impl Limits {
 }
 
 /// How a session is judged.
+#[derive(Clone)]
 pub(crate) struct Evaluators {
     /// At the marks: thorough where nobody waits, quick in a live run.
     pub(crate) at_marks: Evaluator,
@@ -73,6 +77,7 @@ impl Tell {
 
 /// A model in training.
 pub(crate) struct Session {
+    kind: Kind,
     method: Box<dyn Method>,
     checkpoints: Option<Checkpoints>,
     decisions: Option<DecisionLog>,
@@ -82,9 +87,15 @@ pub(crate) struct Session {
     most_at_marks: usize,
     /// At the end.
     last_evaluator: Evaluator,
+    /// Held, in the order they came.
+    keyframes: Vec<Arc<Keyframe>>,
     tests: VecDeque<Arc<Keyframe>>,
     limits: Limits,
     clock: Clock,
+    /// Time it had on a device that it shares.
+    had: Duration,
+    /// When it was done though others were not, seconds.
+    rested_secs: Option<f64>,
     marks: Marks,
     told: Vec<Eval>,
     history: Vec<(f64, f64)>,
@@ -95,26 +106,11 @@ pub(crate) struct Session {
     bar: ProgressBar,
 }
 
-/// Seconds of training; evaluation does not count.
-#[derive(Clone, Copy, Debug, Default)]
-struct Clock {
-    started: Option<Instant>,
-    excluded: Duration,
-    /// Of the runs that this one goes on from.
-    earlier_secs: f64,
-}
-
-impl Clock {
-    fn secs(&self) -> f64 {
-        let of_this_run = |started: Instant| started.elapsed().saturating_sub(self.excluded).as_secs_f64();
-        self.earlier_secs + self.started.map_or(0.0, of_this_run)
-    }
-}
-
 /// What is told at a mark.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct Eval {
     event: &'static str,
+    method: &'static str,
     pub(crate) seconds: f64,
     pub(crate) step: u64,
     #[serde(flatten)]
@@ -142,6 +138,7 @@ pub(crate) struct Outcome {
 #[derive(Clone, Debug, Serialize)]
 struct Done<'a> {
     event: &'static str,
+    method: &'static str,
     seconds: f64,
     steps: u64,
     #[serde(flatten)]
@@ -156,6 +153,7 @@ struct Done<'a> {
 #[derive(Debug, Serialize)]
 struct Profile<'a> {
     event: &'static str,
+    method: &'static str,
     passes: &'a [(&'static str, f64)],
 }
 
@@ -174,11 +172,32 @@ struct Report<'a, T: Serialize> {
     per_image: &'a [ImageScores],
 }
 
+/// One of the sessions that end together: where its results go, and what only its kind of run knows of it.
+pub(crate) struct Ending<P> {
+    pub(crate) session: Session,
+    pub(crate) out: PathBuf,
+    pub(crate) particulars: P,
+}
+
+/// Saves the models; then scores each a last time, writes its report, and tells the end.
+pub(crate) fn finish(mut endings: Vec<Ending<impl Serialize>>) -> anyhow::Result<()> {
+    // Saved before any is scored: a second Ctrl-C during the scoring loses nothing.
+    let ended_secs: Vec<f64> = endings.iter_mut().map(|ending| ending.session.halt()).collect::<anyhow::Result<_>>()?;
+    let mut hashes = Vec::new();
+    for (Ending { session, out, .. }, seconds) in endings.iter_mut().zip(&ended_secs) {
+        hashes.push(session.save(out, *seconds)?);
+    }
+    for ((Ending { session, out, particulars }, seconds), hash) in endings.into_iter().zip(ended_secs).zip(hashes) {
+        session.tell_end(&out, seconds, &hash, &particulars)?;
+    }
+    Ok(())
+}
+
 impl Session {
     /// A session around a fresh model; its clock stands still until [`Self::start_clock`].
     pub(crate) fn new(
         gpu: Arc<Gpu>,
-        method: Box<dyn Method>,
+        (kind, method): (Kind, Box<dyn Method>),
         evaluators: Evaluators,
         limits: Limits,
         tell: Tell,
@@ -186,6 +205,7 @@ impl Session {
         let length = limits.steps.or(limits.seconds.map(whole_secs));
         let template = if length.is_some() { "{bar:30} {elapsed} {msg}" } else { "{spinner} {elapsed} {msg}" };
         Self {
+            kind,
             method,
             checkpoints: None,
             decisions: None,
@@ -193,9 +213,12 @@ impl Session {
             evaluator: evaluators.at_marks,
             most_at_marks: evaluators.most_at_marks,
             last_evaluator: evaluators.at_end,
+            keyframes: Vec::new(),
             tests: VecDeque::new(),
             limits,
             clock: Clock::default(),
+            had: Duration::ZERO,
+            rested_secs: None,
             marks: Marks::default(),
             told: Vec::new(),
             history: Vec::new(),
@@ -223,19 +246,34 @@ impl Session {
 
     /// Goes on where earlier runs had trained for so long; marks they reached are not told again.
     pub(crate) fn going_on_after(mut self, earlier_secs: f64) -> Self {
-        self.clock.earlier_secs = earlier_secs;
+        self.clock = Clock::after(earlier_secs);
         self.marks.reached(earlier_secs);
         self
     }
 
+    /// Makes it one of several that learn by one clock; it shows no bar, for those would stand in each other's way.
+    pub(crate) fn among_others(self, clock: Clock) -> Self {
+        Self { clock, bar: ProgressBar::hidden(), ..self }
+    }
+
+    /// The scene model's kind.
+    pub(crate) fn kind(&self) -> Kind {
+        self.kind
+    }
+
     /// Starts the clock, unless it runs.
     pub(crate) fn start_clock(&mut self, at: Instant) {
-        self.clock.started.get_or_insert(at);
+        self.clock.start(at);
     }
 
     /// When the clock started, once it runs.
     pub(crate) fn clock_started(&self) -> Option<Instant> {
-        self.clock.started
+        self.clock.started()
+    }
+
+    /// Keyframes held, in the order they came.
+    pub(crate) fn keyframes(&self) -> &[Arc<Keyframe>] {
+        &self.keyframes
     }
 
     /// Seconds of training so far.
@@ -248,6 +286,7 @@ impl Session {
         if keyframe.split == Split::Test {
             self.tests.push_back(keyframe.clone());
         }
+        self.keyframes.push(keyframe.clone());
         self.method.push(keyframe.clone())?;
         if let Some(decisions) = &mut self.decisions {
             decisions.pushed(self.method.n_taken()?, keyframe);
@@ -257,7 +296,9 @@ impl Session {
 
     /// Takes a keyframe back.
     pub(crate) fn remove(&mut self, camera: &str, stamp: kinematics::Stamp) -> anyhow::Result<()> {
-        self.tests.retain(|test| test.camera.as_ref() != camera || test.stamp != stamp);
+        let is_other = |held: &Arc<Keyframe>| held.camera.as_ref() != camera || held.stamp != stamp;
+        self.keyframes.retain(is_other);
+        self.tests.retain(is_other);
         self.newest_psnr.retain(|(of, nanos), _| of != camera || *nanos != stamp.0);
         self.method.remove(camera, stamp)?;
         if let Some(decisions) = &mut self.decisions {
@@ -285,8 +326,12 @@ impl Session {
 
     /// Whether a limit was reached.
     pub(crate) fn is_over(&self) -> bool {
-        self.limits.seconds.is_some_and(|secs| self.secs() >= secs)
-            || self.limits.steps.is_some_and(|steps| self.method.progress().step >= steps)
+        self.limits.seconds.is_some_and(|secs| self.secs() >= secs) || self.has_all_steps()
+    }
+
+    /// Whether it made all the steps that were asked for: nothing changes it any more.
+    pub(crate) fn has_all_steps(&self) -> bool {
+        self.limits.steps.is_some_and(|steps| self.method.progress().step >= steps)
     }
 
     /// Whether more steps would do nothing until a keyframe comes.
@@ -296,11 +341,62 @@ impl Session {
 
     /// Trains a slice of at most `n_most` steps, and evaluates when a mark was reached.
     pub(crate) fn step(&mut self, n_most: u64) -> anyhow::Result<u64> {
+        let n = self.learn(n_most)?;
+        self.tell_due()?;
+        Ok(n)
+    }
+
+    /// Trains a slice of at most `n_most` steps.
+    pub(crate) fn learn(&mut self, n_most: u64) -> anyhow::Result<u64> {
         let left = self.limits.steps.map_or(u64::MAX, |steps| steps.saturating_sub(self.method.progress().step));
         if let Some(decisions) = &mut self.decisions {
             decisions.begun();
         }
-        let n = self.method.step(n_most.min(left))?;
+        Ok(self.method.step(n_most.min(left))?)
+    }
+
+    /// Trains for a turn on a device that others use too, at most `n_most` steps; what was queued is done at its end.
+    pub(crate) fn take_turn(&mut self, n_most: impl Fn(&Self) -> u64) -> anyhow::Result<()> {
+        let begun = Instant::now();
+        let mut n_steps = 0;
+        loop {
+            let n = self.learn(n_most(self))?;
+            n_steps += n;
+            let is_at_end = self.is_over() || self.is_idle() || n_most(self) == 0;
+            if n == 0 || is_at_end || begun.elapsed() >= TURN {
+                break;
+            }
+        }
+        self.method.n_taken()?;
+        // Who can do nothing does not take each turn because of that.
+        self.had += if n_steps == 0 { TURN } else { begun.elapsed() };
+        if self.has_all_steps() {
+            self.rest();
+        }
+        Ok(())
+    }
+
+    /// Time it had on a device that it shares.
+    pub(crate) fn had(&self) -> Duration {
+        self.had
+    }
+
+    /// Lets it catch up on no more than what it lacks of this.
+    pub(crate) fn had_at_least(&mut self, had: Duration) {
+        self.had = self.had.max(had);
+    }
+
+    /// Takes it for done, at this time of the clock.
+    pub(crate) fn rest(&mut self) {
+        let secs = self.secs();
+        self.rested_secs.get_or_insert(secs);
+    }
+
+    /// Writes the checkpoint that is due, and evaluates when a mark was reached; one that rests has told all.
+    pub(crate) fn tell_due(&mut self) -> anyhow::Result<()> {
+        if self.rested_secs.is_some() {
+            return Ok(());
+        }
         let seconds = self.secs();
         if let Some(checkpoints) = &mut self.checkpoints
             && checkpoints.when_due(self.method.as_mut(), seconds)?
@@ -312,7 +408,7 @@ impl Session {
             self.tell_mark()?;
         }
         self.show();
-        Ok(n)
+        Ok(())
     }
 
     /// Evaluates the test keyframe whose score is oldest, for a curve between the marks; counts as training time.
@@ -348,11 +444,8 @@ impl Session {
         self.method.progress()
     }
 
-    /// Saves the model, scores it a last time, writes the report, and tells the end.
-    ///
-    /// `particulars` are what only this kind of run knows.
-    pub(crate) fn finish(mut self, out: &Path, particulars: &impl Serialize) -> anyhow::Result<()> {
-        let seconds = self.halt()?;
+    /// Saves the model after so many seconds of training; its hash comes back.
+    fn save(&mut self, out: &Path, seconds: f64) -> anyhow::Result<String> {
         if let Some(decisions) = self.decisions.take()
             && let Err(error) = decisions.end(self.method.n_taken()?)
         {
@@ -361,22 +454,32 @@ impl Session {
         if self.method.progress().primitives == 0 {
             log::warn!("the model is empty: nothing that was seen could be used");
         }
-        // Saved before it is scored: a second Ctrl-C during the scoring loses nothing.
         run_folder::save_model(self.method.as_mut(), out)?;
         if let Some(checkpoints) = &mut self.checkpoints {
             checkpoints.begin(self.method.as_mut(), seconds)?;
         }
-        let checkpoint_sha256 = run_folder::checkpoint_sha256(out)?;
+        run_folder::checkpoint_sha256(out)
+    }
+
+    /// Scores the saved model a last time, writes the report, and tells the end.
+    fn tell_end(
+        mut self,
+        out: &Path,
+        seconds: f64,
+        checkpoint_sha256: &str,
+        particulars: &impl Serialize,
+    ) -> anyhow::Result<()> {
         let outcome = self.score_at_end(seconds)?;
         let done = Done {
             event: "done",
+            method: self.kind.name(),
             seconds,
             steps: outcome.steps,
             scores: outcome.scores,
             primitives: outcome.primitives,
             bytes: outcome.bytes,
             out,
-            checkpoint_sha256: &checkpoint_sha256,
+            checkpoint_sha256,
         };
         let passes = if self.profiles { self.profile()? } else { Vec::new() };
         let report = Report {
@@ -393,7 +496,8 @@ impl Session {
         match self.tell {
             Tell::Json => {
                 if self.profiles {
-                    print::json(&Profile { event: "profile", passes: &report.passes })?;
+                    let passes = &report.passes;
+                    print::json(&Profile { event: "profile", method: self.kind.name(), passes })?;
                 }
                 print::json(&done)?;
                 return last_checkpoint;
@@ -445,7 +549,7 @@ impl Session {
     /// Waits for what is queued; the seconds of training come back.
     fn halt(&mut self) -> anyhow::Result<f64> {
         self.gpu.wait()?;
-        let seconds = self.secs();
+        let seconds = self.rested_secs.unwrap_or_else(|| self.secs());
         self.bar.finish_and_clear();
         Ok(seconds)
     }
@@ -474,7 +578,7 @@ impl Session {
         let tests: Vec<Arc<Keyframe>> = self.tests.iter().step_by(stride).cloned().collect();
         let images = self.evaluator.score_all(self.method.as_mut(), &tests)?;
         self.gpu.wait()?;
-        self.clock.excluded += before.elapsed();
+        self.clock.exclude(before.elapsed());
         Ok(images)
     }
 
@@ -490,6 +594,7 @@ impl Session {
         let progress = self.method.progress();
         let eval = Eval {
             event: "eval",
+            method: self.kind.name(),
             seconds,
             step: progress.step,
             scores: Scores::mean(&images),

@@ -3,10 +3,11 @@
 use crate::config::{Rig, USUAL_SEED};
 use crate::data::Data;
 use crate::exit::{BadArgument, LackOfEvidence};
-use crate::method::{self, Kind};
+use crate::method::{self, Kind, Recipe};
 use crate::session::{Evaluators, Limits, Session, Tell};
 use crate::stop::Stop;
 use crate::training_args::{Evidence, HowMany, Refine, Refining, TrainingArgs};
+use crate::turns;
 use std::sync::Arc;
 use std::time::Instant;
 use trainer::Keyframe;
@@ -15,8 +16,7 @@ use trainer::splat::SplatOptions;
 
 /// All that settles a training beside its keyframes.
 pub(crate) struct Plan {
-    pub(crate) kind: Kind,
-    pub(crate) options: SplatOptions,
+    pub(crate) recipe: Recipe,
     pub(crate) evaluators: Evaluators,
     pub(crate) limits: Limits,
     pub(crate) tell: Tell,
@@ -26,67 +26,74 @@ pub(crate) struct Plan {
 ///
 /// The clock starts when everything is compiled; seeding counts.
 pub(crate) fn train(gpu: Arc<Gpu>, plan: Plan, keyframes: &[Arc<Keyframe>], stop: &Stop) -> anyhow::Result<Session> {
-    let mut method = plan.kind.start(gpu.clone(), plan.options)?;
+    let kind = plan.recipe.kind;
+    let mut method = plan.recipe.start(gpu.clone())?;
     method.prepare()?;
-    drive(Session::new(gpu, method, plan.evaluators, plan.limits, plan.tell), keyframes, stop)
-}
-
-/// Starts the clock, pushes the keyframes, and trains until a limit, or until `stop` is asked.
-pub(crate) fn drive(mut session: Session, keyframes: &[Arc<Keyframe>], stop: &Stop) -> anyhow::Result<Session> {
-    session.start_clock(Instant::now());
-    for keyframe in keyframes {
-        session.push(keyframe)?;
-    }
-    if session.is_idle() && session.progress().step == 0 {
-        return Err(LackOfEvidence(
-            "no image to learn from has depth, and this scene model is made of depth".to_owned(),
-        )
-        .into());
-    }
-    while !stop.asked() && !session.is_over() && !session.is_idle() {
-        session.step(u64::MAX)?;
-    }
+    let mut session = Session::new(gpu, (kind, method), plan.evaluators, plan.limits, plan.tell);
+    drive(std::slice::from_mut(&mut session), keyframes, stop)?;
     Ok(session)
 }
 
-/// The scene model: the recording's rig file says which, with the flags over it; a folder has the flags only.
-pub(crate) fn model(
+/// Starts the clock, pushes the keyframes to all models, and trains each until a limit, or until `stop` is asked.
+pub(crate) fn drive(sessions: &mut [Session], keyframes: &[Arc<Keyframe>], stop: &Stop) -> anyhow::Result<()> {
+    let now = Instant::now();
+    for session in &mut *sessions {
+        session.start_clock(now);
+        for keyframe in keyframes {
+            session.push(keyframe)?;
+        }
+        if session.is_idle() && session.progress().step == 0 {
+            let name = session.kind().name();
+            return Err(LackOfEvidence(format!(
+                "no image to learn from has depth, and the scene model of the method {name} is made of depth"
+            ))
+            .into());
+        }
+    }
+    let is_done = |session: &Session| session.is_over() || session.is_idle();
+    while !stop.asked() && !sessions.iter().all(is_done) {
+        turns::take(sessions, |_, _| u64::MAX)?;
+        sessions.iter_mut().filter(|session| session.is_idle()).for_each(Session::rest);
+    }
+    Ok(())
+}
+
+/// The scene models: the recording's rig file says which, with the flags over it; a folder has the flags only.
+pub(crate) fn recipes(
     args: &TrainingArgs,
     data: &Data,
     steps: Option<u64>,
     software: bool,
-) -> Result<(Kind, SplatOptions), BadArgument> {
-    let kind = match &data.rig {
-        Some(rig) => Kind::of_rig(rig)?,
-        None => args.method.unwrap_or(Kind::Splat),
-    };
-    args.check_for(kind)?;
+) -> Result<Vec<Recipe>, BadArgument> {
+    let of_rig = data.rig.as_ref().map(|rig| rig.train.methods.as_slice());
+    let kinds = of_rig.or(args.methods()).unwrap_or(&[Kind::Splat]);
+    args.check_for(kinds)?;
     // A trial takes hundreds of steps more: on a processor that is minutes.
     let evidence = Evidence {
         joints: data.rig.is_some(),
         drifts: data.rig.as_ref().is_none_or(Rig::has_moving_base),
-        depth: data.keyframes.iter().any(|keyframe| keyframe.depth.is_some()),
+        depth: data.has_depth(),
     };
     let Refining { align, learn: cameras } =
         args.refining(evidence, if software { Refine::None } else { Refine::Auto })?;
-    args.check_learned(kind, evidence)?;
+    args.check_learned(kinds, evidence)?;
     let count = args.count(if software { HowMany::ToCap } else { HowMany::Tested });
-    if let Some(rig) = &data.rig {
-        let options = SplatOptions { cameras, align, count, ..method::options(&rig.train, steps)? };
-        return Ok((kind, options));
-    }
-    let usual = SplatOptions::default();
-    let options = SplatOptions {
-        seed: args.seed.unwrap_or(USUAL_SEED),
-        max_splats: args.max_splats.map_or(usual.max_splats, |n| n.try_into().unwrap_or(u32::MAX)),
-        max_bytes: args.max_bytes,
-        cameras,
-        count,
-        align,
-        n_planned_steps: steps.unwrap_or(usual.n_planned_steps),
-        ..usual
+    let options = if let Some(rig) = &data.rig {
+        SplatOptions { cameras, align, count, ..method::options(&rig.train, steps)? }
+    } else {
+        let usual = SplatOptions::default();
+        SplatOptions {
+            seed: args.seed.unwrap_or(USUAL_SEED),
+            max_splats: args.max_splats.map_or(usual.max_splats, |n| n.try_into().unwrap_or(u32::MAX)),
+            max_bytes: args.max_bytes,
+            cameras,
+            count,
+            align,
+            n_planned_steps: steps.unwrap_or(usual.n_planned_steps),
+            ..usual
+        }
     };
-    Ok((kind, options))
+    Ok(kinds.iter().map(|kind| Recipe { kind: *kind, options: options.clone() }).collect())
 }
 
 /// When to stop, from `--seconds` and `--steps`; after `usual_secs` when neither is given.

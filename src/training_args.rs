@@ -1,8 +1,8 @@
 //! Flags that every training command has; they override keys of the same name in a rig file.
 
-use crate::config::{MAX_BYTES, MAX_SPLATS, Override, SEED};
+use crate::config::{self, MAX_BYTES, MAX_SPLATS, Override, SEED};
 use crate::exit::BadArgument;
-use crate::method::Kind;
+use crate::method::{self, Kind};
 use clap::value_parser;
 use trainer::align;
 use trainer::splat::{CameraChoice, CountChoice, TermSet};
@@ -10,10 +10,10 @@ use trainer::splat::{CameraChoice, CountChoice, TermSet};
 /// What to train, and how large it may become.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct TrainingArgs {
-    /// Scene model: splat; nerf, a neural field; or tsdf, a distance field with a mesh [default: the rig
-    /// file's, else splat]
-    #[arg(long, value_name = "METHOD", hide_possible_values = true)]
-    pub(crate) method: Option<Kind>,
+    /// Scene model: splat; nerf, a neural field; or tsdf, a distance field with a mesh; several, separated by commas, learn
+    /// at once [default: the rig file's, else splat]
+    #[arg(long, value_name = "METHOD", value_parser = methods)]
+    pub(crate) method: Option<Methods>,
     /// Seed of everything random, 0 to 2^63 - 1; with --steps, one seed gives one result [default: the rig file's, else 1]
     #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(SEED))]
     pub(crate) seed: Option<u64>,
@@ -32,6 +32,22 @@ pub(crate) struct TrainingArgs {
     /// 0.1 dB on held-back images) or to-cap (--max-splats) [default: to-cap; for data on disk tested on a GPU]
     #[arg(long, value_name = "HOW", hide_possible_values = true)]
     pub(crate) count: Option<HowMany>,
+}
+
+/// Different scene models, at least one.
+#[derive(Clone, Debug)]
+pub(crate) struct Methods(Vec<Kind>);
+
+fn methods(text: &str) -> Result<Methods, String> {
+    let mut kinds = Vec::new();
+    for name in text.split(',') {
+        let kind = Kind::named(name).ok_or_else(|| format!("there is no {name:?}, only splat, nerf and tsdf"))?;
+        if kinds.contains(&kind) {
+            return Err(format!("{name} stands there twice"));
+        }
+        kinds.push(kind);
+    }
+    Ok(Methods(kinds))
 }
 
 /// What `--count` takes.
@@ -78,29 +94,35 @@ pub(crate) struct Evidence {
 }
 
 impl TrainingArgs {
-    /// Refuses flags that only splats have where the scene model is another.
-    pub(crate) fn check_for(&self, kind: Kind) -> Result<(), BadArgument> {
+    /// The scene models asked for, if any are.
+    pub(crate) fn methods(&self) -> Option<&[Kind]> {
+        self.method.as_ref().map(|Methods(kinds)| kinds.as_slice())
+    }
+
+    /// Refuses flags that only splats have where no scene model is splats.
+    pub(crate) fn check_for(&self, kinds: &[Kind]) -> Result<(), BadArgument> {
         let of_splats = [(self.max_splats.is_some(), "--max-splats"), (self.count.is_some(), "--count")];
-        match of_splats.into_iter().find(|(is_given, _)| *is_given && kind != Kind::Splat) {
-            Some((_, flag)) => {
-                Err(BadArgument(format!("{flag}: only the method splat has it, and the method is {}", kind.name())))
-            }
+        match of_splats.into_iter().find(|(is_given, _)| *is_given && !kinds.contains(&Kind::Splat)) {
+            Some((_, flag)) => Err(BadArgument(format!(
+                "{flag}: only the method splat has it, and the method is {}",
+                method::in_words(kinds)
+            ))),
             None => Ok(()),
         }
     }
 
-    /// Refuses terms that were asked for and that the scene model does not learn: those that come along with the scene.
-    pub(crate) fn check_learned(&self, kind: Kind, evidence: Evidence) -> Result<(), BadArgument> {
+    /// Refuses terms that were asked for and that no scene model learns: those that come along with the scene.
+    pub(crate) fn check_learned(&self, kinds: &[Kind], evidence: Evidence) -> Result<(), BadArgument> {
         let can_align = |term: &Refine| evidence.depth && *term != Refine::ImageGains;
-        let can_learn = |term: &Refine| kind == Kind::Nerf && *term == Refine::ImagePoses;
+        let can_learn = |term: &Refine| kinds.contains(&Kind::Nerf) && *term == Refine::ImagePoses;
         let is_left = |term: &Refine| matches!(term, Refine::Auto | Refine::None) || can_align(term) || can_learn(term);
-        if kind == Kind::Splat || self.refine.iter().all(is_left) {
+        if kinds.contains(&Kind::Splat) || self.refine.iter().all(is_left) {
             return Ok(());
         }
-        let along = if kind == Kind::Nerf { ", learns image-poses along" } else { "" };
+        let along = if kinds.contains(&Kind::Nerf) { ", learns image-poses along" } else { "" };
         Err(BadArgument(format!(
             "--refine: the method {} corrects cameras by laying images with depth over each other at the start{along}, and no others",
-            kind.name()
+            method::in_words(kinds)
         )))
     }
 
@@ -155,8 +177,8 @@ impl TrainingArgs {
     /// The keys of the rig file that the flags stand for.
     pub(crate) fn overrides(&self) -> Vec<Override> {
         let mut overrides = Vec::new();
-        if let Some(method) = self.method {
-            overrides.push(Override::new("train.method", method.name()));
+        if let Some(kinds) = self.methods() {
+            overrides.push(Override::new("train.method", config::methods(kinds)));
         }
         if let Some(seed) = self.seed {
             overrides.push(Override::new("train.seed", seed.cast_signed()));
@@ -192,15 +214,12 @@ impl Evidence {
 mod tests {
     use super::*;
 
+    fn no_flags() -> TrainingArgs {
+        TrainingArgs { method: None, seed: None, max_bytes: None, max_splats: None, refine: Vec::new(), count: None }
+    }
+
     fn refining(asked: &[Refine], joints: bool, depth: bool) -> Result<Refining, String> {
-        let args = TrainingArgs {
-            method: None,
-            seed: None,
-            max_bytes: None,
-            max_splats: None,
-            refine: asked.to_vec(),
-            count: None,
-        };
+        let args = TrainingArgs { refine: asked.to_vec(), ..no_flags() };
         args.refining(Evidence { joints, drifts: !joints, depth }, Refine::None).map_err(|error| error.to_string())
     }
 
@@ -224,6 +243,21 @@ mod tests {
             assert_eq!((candidates(align), candidates(learn)), (aligned, learned), "joints {joints}, depth {depth}");
         }
         assert_eq!(refining(&[], true, true), Ok(Refining::default()));
+    }
+
+    #[test]
+    fn methods_are_different_ones_and_flags_of_splats_need_splats() {
+        assert_eq!(methods("tsdf,splat").map(|Methods(kinds)| kinds), Ok(vec![Kind::Tsdf, Kind::Splat]));
+        for (text, told) in [("mesh", "\"mesh\""), ("splat,splat", "twice"), ("splat,", "\"\""), ("", "\"\"")] {
+            assert!(methods(text).is_err_and(|error| error.contains(told)), "{text}");
+        }
+        let args = TrainingArgs { max_splats: Some(5), refine: vec![Refine::ImageGains], ..no_flags() };
+        let evidence = Evidence { joints: true, drifts: false, depth: true };
+        let both = [Kind::Tsdf, Kind::Splat];
+        assert!(args.check_for(&both).is_ok() && args.check_learned(&both, evidence).is_ok());
+        let told = args.check_for(&[Kind::Tsdf, Kind::Nerf]).unwrap_err().0;
+        assert!(told.contains("--max-splats") && told.contains("tsdf and nerf"), "{told}");
+        assert!(args.check_learned(&[Kind::Tsdf], evidence).is_err());
     }
 
     #[test]

@@ -114,6 +114,59 @@ fn a_curve_is_drawn_with_a_peer_and_goes_on_where_it_stopped() {
     assert_refused(folder, &changed, 2, &["max_splats", "--out c"]);
 }
 
+/// Depth images, a metre everywhere: what the wall of [`scene`] is away.
+fn add_depth(folder: &Path) {
+    let file = folder.join("transforms.json");
+    let mut scene: Value = serde_json::from_slice(&std::fs::read(&file).expect("a scene")).expect("JSON");
+    let [width, height] = SIZE_PX;
+    for frame in scene["frames"].as_array_mut().expect("frames") {
+        let name = format!("depth_{}", frame["file_path"].as_str().expect("a name"));
+        let depth = image::ImageBuffer::<image::Luma<u16>, _>::from_pixel(width, height, image::Luma([1000]));
+        depth.save(folder.join(&name)).expect("room on the disk");
+        frame["depth_file_path"] = json!(name);
+    }
+    std::fs::write(file, scene.to_string()).expect("room on the disk");
+}
+
+#[test]
+fn a_curve_of_several_methods_has_a_line_for_each_that_the_data_suffice_for() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    for data in ["deep", "flat"] {
+        std::fs::create_dir(folder.join(data)).expect("room on the disk");
+        scene(&folder.join(data));
+    }
+    add_depth(&folder.join("deep"));
+    let one = ["curve", "deep", "flat", "--seconds", "0.4", "--seeds", "1", "--max-splats", "300", "--out", "c"];
+    let told = events(folder, &[&one[..], &["--method", "splat", "--json"]].concat());
+    assert_eq!(told.iter().filter(|event| event["event"] == "run").count(), 2);
+    // More methods join in the same folder, and what is done is not repeated.
+    let told = events(folder, &[&one[..], &["--method", "splat,tsdf,nerf", "--json"]].concat());
+    let kept: Vec<bool> = told.iter().filter_map(|event| event["kept"].as_bool()).collect();
+    assert_eq!(kept, [true, false, false, true, false]);
+    let findings = &told.last().expect("events")["findings"];
+    let lines = findings["lines"].as_array().expect("lines");
+    let labels: Vec<&str> = lines.iter().filter_map(|line| line["label"].as_str()).collect();
+    assert_eq!(labels, ["deep, splat", "deep, tsdf", "deep, nerf", "flat, splat", "flat, nerf"]);
+    assert!(findings["notes"][0].as_str().is_some_and(|note| note.contains("flat has no depth")), "{findings}");
+    for line in lines {
+        assert_eq!(Some(line["method"].as_str()), line["label"].as_str().map(|label| label.split(", ").nth(1)));
+        assert!(line["points"].as_array().is_some_and(|points| !points.is_empty()), "{line}");
+        for known in ["psnr", "seconds", "primitives", "bytes"] {
+            assert!(line["summary"][known].as_f64() > Some(0.0), "{known}: {line}");
+        }
+    }
+    assert!(lines[1]["summary"]["seconds"].as_f64() < Some(0.4), "a distance field is done early: {}", lines[1]);
+    assert_chart(&folder.join("c"), "curve");
+    assert_chart(&folder.join("c"), "curve-size");
+    let page = std::fs::read_to_string(folder.join("c/curve.html")).expect("a page");
+    assert!(page.contains("deep, nerf") && page.contains("flat has no depth"), "{page}");
+
+    assert_refused(folder, &["curve", "flat", "--method", "tsdf", "--seconds", "1", "--out", "d"], 4, &["depth"]);
+    assert_refused(folder, &["budget", "flat", "--method", "splat,nerf"], 2, &["splat and nerf"]);
+    assert_refused(folder, &["stability", "flat", "--method", "splat,nerf"], 2, &["one method"]);
+}
+
 #[test]
 fn a_budget_tells_the_trainers_own_choice() {
     let folder = tempfile::tempdir().expect("a folder");

@@ -139,6 +139,10 @@ fn arguments_that_make_no_sense_exit_with_2() {
     let rig = changed_rig(folder.path(), "seed = 1", "seed = 2");
     assert_refused(&["run", &rig, "--sim", "--steps-per-keyframe", "3"], 2, &["--steps-per-keyframe", "--lockstep"]);
     assert_refused(&["run", "rig.toml", "--lockstep", "--from", "scan.mcap"], 2, &["--from"]);
+    let out = folder.path().join("endless.mcap");
+    let record = ["record", &rig, "--sim", "--lockstep", "--out", out.to_str().expect("a plain name")];
+    assert_refused(&record, 2, &["lockstep", "--seconds"]);
+    assert!(!out.exists(), "what is refused leaves nothing behind");
     for (flag, value) in [("--max-splats", "9"), ("--refine", "mount"), ("--count", "to-cap")] {
         for method in ["nerf", "tsdf"] {
             let run = ["run", &rig, "--sim", "--method", method, flag, value];

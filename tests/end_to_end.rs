@@ -174,7 +174,99 @@ fn a_neural_field_is_learned_live_replayed_scored_drawn_and_gone_on_with() {
 
     let exported = fieldrig(folder, &["export", "live", "--to", "ply", "--out", "splats.ply"]);
     let told = String::from_utf8_lossy(&exported.stderr);
-    assert!(!exported.status.success() && told.contains("a neural field, which has no splats"), "{told}");
+    assert!(
+        !exported.status.success() && told.contains("a neural field, which has neither splats nor a mesh"),
+        "{told}"
+    );
+}
+
+#[test]
+fn several_methods_grow_live_as_each_does_alone_and_a_viewer_chooses() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    rig_file(folder);
+    events(folder, &["record", "rig.toml", "--sim", "--out", "scan.mcap", "--json"]);
+    let replay = |method: &str, out: &str| {
+        let run = ["run", "rig.toml", "--from", "scan.mcap", "--method", method, "--steps", N_FUSED, "--out", out];
+        let told =
+            events(folder, &[&run[..], &["--steps-per-keyframe", "1", "--listen", "127.0.0.1:0", "--json"]].concat());
+        let hash = |done: &Value| done["checkpoint_sha256"].as_str().expect("a hash").to_owned();
+        told.iter().filter(|event| event["event"] == "done").map(hash).collect::<Vec<_>>()
+    };
+    let together = replay("tsdf,splat", "both");
+    assert_eq!(together, [replay("tsdf", "tsdf"), replay("splat", "splat")].concat());
+    let lists = ["both/tsdf", "tsdf", "both/splat", "splat"].map(|run| folder.join(run).join("keyframes.txt"));
+    let [tsdf_there, tsdf, splat_there, splat] = lists.map(|file| std::fs::read_to_string(file).expect("a list"));
+    assert!(tsdf_there == tsdf && splat_there == splat, "which keyframes a model had");
+    let rig = |file: &str| std::fs::read_to_string(folder.join(file)).expect("a settled rig file");
+    assert!(rig("both/rig.toml").contains("method = [") && rig("both/splat/rig.toml").contains("method = \"splat\""));
+
+    let mut run = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
+        .args(["run", "rig.toml", "--from", "scan.mcap", "--method", "tsdf,splat"])
+        .args(["--steps-per-keyframe", "1", "--out", "seen", "--listen", "127.0.0.1:0", "--json"])
+        .current_dir(folder)
+        .stdout(Stdio::piped())
+        .spawn()
+        .expect("fieldrig starts");
+    let mut lines = BufReader::new(run.stdout.take().expect("piped")).lines();
+    let mut event = || -> Option<Value> { serde_json::from_str(&lines.next()?.expect("a line")).ok() };
+    let serving = event().expect("the address");
+    while event().expect("an event before the end")["event"] != "eval" {}
+    looks_at_each(serving["url"].as_str().expect("an address"));
+    let interrupted = Command::new("sh").args(["-c", &format!("kill -INT {}", run.id())]).status().expect("sh starts");
+    assert!(interrupted.success());
+    let done = std::iter::from_fn(event).filter(|event| event["event"] == "done").count();
+    assert_eq!((run.wait().expect("it ends").code(), done), (Some(0), 2));
+}
+
+/// Asks for a picture of each model there is, and of one that is not there.
+fn looks_at_each(url: &str) {
+    let address = url.trim_start_matches("http://").trim_end_matches('/');
+    let stream = std::net::TcpStream::connect(address).expect("the server listens");
+    stream.set_read_timeout(Some(std::time::Duration::from_secs(60))).expect("a timeout");
+    let (mut socket, _) = tungstenite::client(format!("ws://{address}/ws"), stream).expect("a WebSocket");
+    let mut ask = |id: u64, method: Option<&str>| -> Value {
+        let mut message = serde_json::json!({
+            "type": "render", "id": id, "size_px": [64, 48], "stages": [1.0],
+            "world_from_camera": [1, 0, 0, 0.5, 0, -1, 0, 0, 0, 0, -1, 0.6, 0, 0, 0, 1],
+            "projection": {"kind": "pinhole", "vertical_fov_rad": 0.9},
+        });
+        if let Some(method) = method {
+            message["method"] = method.into();
+        }
+        socket.send(tungstenite::Message::text(message.to_string())).expect("sent");
+        loop {
+            let (answer, payload): (Value, Vec<u8>) = match socket.read().expect("an answer") {
+                tungstenite::Message::Text(text) => (serde_json::from_str(&text).expect("JSON"), Vec::new()),
+                tungstenite::Message::Binary(bytes) => {
+                    let n_header = u32::from_le_bytes(bytes[..4].try_into().expect("4 bytes")) as usize;
+                    let header = serde_json::from_slice(&bytes[4..4 + n_header]).expect("JSON");
+                    (header, bytes[4 + n_header..].to_vec())
+                }
+                _ => continue,
+            };
+            if answer["type"] == "status" && answer["others"] != serde_json::json!([]) {
+                assert_eq!((&answer["method"], &answer["others"][0]["method"]), (&"tsdf".into(), &"splat".into()));
+            }
+            if answer["id"] == id && answer["type"] != "status" {
+                return if answer["type"] == "picture" { serde_json::json!(payload) } else { answer };
+            }
+        }
+    };
+    // Both are the same once the distance field has taken in all there is.
+    let mut ids = 1..200;
+    let tsdf = loop {
+        let mut next = || ids.next().expect("the first is never the usual one");
+        let (usual, tsdf) = (ask(next(), None), ask(next(), Some("tsdf")));
+        if usual == tsdf {
+            break tsdf;
+        }
+        std::thread::sleep(std::time::Duration::from_millis(300));
+    };
+    let splat = ask(201, Some("splat"));
+    assert!(tsdf.is_array() && splat.is_array() && splat != tsdf, "the models look different");
+    let told = ask(202, Some("nerf"))["message"].as_str().expect("an error").to_owned();
+    assert!(told.contains("\"nerf\"") && told.contains("tsdf, splat"), "{told}");
 }
 
 /// What `run` said of its model, `eval` says of the saved one.

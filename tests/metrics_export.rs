@@ -103,17 +103,29 @@ fn a_model_is_exported_as_ply() {
     std::fs::create_dir(&model).unwrap();
     let splats = synthetic_cloud(20, 1);
     ply::write(&model.join("splats.ply"), &splats).unwrap();
-    let output = fieldrig(&["export", text(&model), "--to", "ply", "--out", text(&out)]);
+    let export = ["export", text(&model), "--to", "ply", "--out", text(&out)];
+    let output = fieldrig(&export);
     assert!(output.status.success(), "{output:?}");
     assert_eq!(ply::read(&out).unwrap(), splats);
 
+    let said = complaint(&fieldrig(&export), 2);
+    assert!(said.contains("scene.ply: it is there already"), "{said}");
+    let out = folder.path().join("other.ply");
+    let said = complaint(&fieldrig(&["export", text(&model), "--to", "spz", "--out", text(&out)]), 2);
+    assert!(said.contains("ends in .spz"), "{said}");
+    let glb = folder.path().join("mesh.glb");
+    let said = complaint(&fieldrig(&["export", text(&model), "--to", "glb", "--out", text(&glb)]), 2);
+    assert!(said.contains("which have no mesh"), "{said}");
+    let said =
+        complaint(&fieldrig(&["export", text(&model), "--to", "ply", "--cell-m", "0.1", "--out", text(&out)]), 2);
+    assert!(said.contains("--cell-m") && said.contains("has no mesh"), "{said}");
     let said = complaint(&fieldrig(&["export", text(&model), "--to", "nerfstudio", "--out", text(&out)]), 2);
     assert!(said.contains("nerfstudio is written of a recording"), "{said}");
     let nothing = folder.path().join("nothing");
     let said = complaint(&fieldrig(&["export", text(&nothing), "--to", "ply", "--out", text(&out)]), 2);
     assert!(said.contains("nothing does not exist"), "{said}");
     let said = complaint(&fieldrig(&["export", text(folder.path()), "--to", "ply", "--out", text(&out)]), 2);
-    assert!(said.contains("neither a folder with splats.ply, nor a file of splats, nor a recording"), "{said}");
+    assert!(said.contains("neither a folder with a model, nor a file of splats, nor a recording"), "{said}");
     let other = folder.path().join("other.bin");
     std::fs::write(&other, b"neither").unwrap();
     let said = complaint(&fieldrig(&["export", text(&other), "--to", "nerfstudio", "--out", text(&nothing)]), 1);
@@ -135,6 +147,7 @@ fn a_model_is_exported_as_spz_and_back() {
 
     let whole = std::fs::read(&spz_file).unwrap();
     std::fs::write(&spz_file, &whole[..whole.len() / 2]).unwrap();
+    let again = folder.path().join("cut.ply");
     let said = complaint(&fieldrig(&["export", text(&spz_file), "--to", "ply", "--out", text(&again)]), 1);
     assert!(said.contains("scene.spz") && said.contains("cut off"), "{said}");
 }

@@ -19,6 +19,8 @@ pub(crate) struct Row {
     pub(crate) psnr: f64,
     /// Primitives, where told.
     pub(crate) n: Option<u64>,
+    /// Bytes of the model, where told.
+    pub(crate) bytes: Option<u64>,
 }
 
 #[derive(Deserialize)]
@@ -58,10 +60,10 @@ mod tests {
         let place = folder.path().join("gsplat_fox.json");
         let write = |text: &str| std::fs::write(&place, text).expect("written");
         write(
-            r#"{"args": {"seed": 0}, "rows": [{"seconds": 1.0, "step": 9, "psnr": 12.4, "ssim": 0.6, "n": 7}, {"seconds": 0.5, "psnr": 11.0}]}"#,
+            r#"{"args": {"seed": 0}, "rows": [{"seconds": 1.0, "step": 9, "psnr": 12.4, "ssim": 0.6, "n": 7, "bytes": 1652}, {"seconds": 0.5, "psnr": 11.0}]}"#,
         );
         let peer = Peer::load(&place).expect("a curve");
-        assert_eq!((peer.label.as_str(), peer.rows[1].n), ("gsplat_fox", Some(7)));
+        assert_eq!((peer.label.as_str(), peer.rows[1].n, peer.rows[1].bytes), ("gsplat_fox", Some(7), Some(1652)));
         assert_eq!(peer.curve(), [(0.5, 11.0), (1.0, 12.4)]);
         for other in ["[]", r#"{"rows": []}"#, r#"{"rows": [{"seconds": 0.0, "psnr": 1.0}]}"#] {
             write(other);

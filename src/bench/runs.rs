@@ -3,7 +3,7 @@
 use crate::data::{Data, DataArgs, Purpose};
 use crate::evaluate::Evaluator;
 use crate::exit::{BadArgument, LackOfEvidence};
-use crate::method::Kind;
+use crate::method::{self, Kind, Recipe};
 use crate::session::{Eval, Evaluators, Limits, Outcome, Tell};
 use crate::stop::Stop;
 use crate::training::{self, Plan};
@@ -114,16 +114,15 @@ pub(crate) struct NamedData {
     pub(crate) name: String,
     pub(crate) path: PathBuf,
     pub(crate) data: Data,
-    pub(crate) kind: Kind,
-    /// As the flags and the recording say.
-    pub(crate) options: SplatOptions,
+    /// The scene models that the flags and the recording ask for.
+    pub(crate) recipes: Vec<Recipe>,
 }
 
 /// One training to do.
 pub(crate) struct Job<'a> {
     pub(crate) name: String,
     pub(crate) data: &'a NamedData,
-    pub(crate) options: SplatOptions,
+    pub(crate) recipe: Recipe,
     pub(crate) limits: Limits,
     pub(crate) disturbed: Option<Disturbed>,
     pub(crate) variant: Option<String>,
@@ -144,15 +143,30 @@ pub(crate) struct Runs<'a> {
 }
 
 impl NamedData {
-    /// Refuses other scene models than splats, for a bench of what only those have.
-    pub(crate) fn expect_splats(&self) -> Result<(), BadArgument> {
-        match self.kind {
-            Kind::Splat => Ok(()),
-            other => {
-                let (data, method) = (&self.name, other.name());
-                Err(BadArgument(format!("{data}: this bench is of splats, and the method is {method}")))
+    /// The scene model, for a bench of one; several are refused.
+    pub(crate) fn only_recipe(&self) -> Result<&Recipe, BadArgument> {
+        match &self.recipes[..] {
+            [one] => Ok(one),
+            _ => {
+                Err(BadArgument(format!("{}: this bench is of one method, {} are too many", self.name, self.methods())))
             }
         }
+    }
+
+    /// How splats are trained, for a bench of what only those have; other scene models are refused.
+    pub(crate) fn splats(&self) -> Result<&SplatOptions, BadArgument> {
+        match &self.recipes[..] {
+            [Recipe { kind: Kind::Splat, options }] => Ok(options),
+            _ => {
+                let (data, methods) = (&self.name, self.methods());
+                Err(BadArgument(format!("{data}: this bench is of splats, and the method is {methods}")))
+            }
+        }
+    }
+
+    fn methods(&self) -> String {
+        let kinds: Vec<Kind> = self.recipes.iter().map(|recipe| recipe.kind).collect();
+        method::in_words(&kinds)
     }
 }
 
@@ -177,9 +191,9 @@ impl<'a> Runs<'a> {
         self.gpu.describe()
     }
 
-    /// Says how many runs there will be.
-    pub(crate) fn expect(&mut self, n_all: usize) {
-        self.n_all = n_all;
+    /// Says how many runs there will be from now on.
+    pub(crate) fn expect(&mut self, n_more: usize) {
+        self.n_all = self.n_done + n_more;
     }
 
     /// Loads data, and finds a name for it that none of `taken` has.
@@ -190,8 +204,8 @@ impl<'a> Runs<'a> {
             let reason = "no image is held out for testing, so nothing can be scored: see --holdout";
             return Err(LackOfEvidence(format!("{}: {reason}", path.display())).into());
         }
-        let (kind, options) = training::model(&self.args.training, &data, None, self.gpu.is_software())?;
-        Ok(NamedData { name: free_name(path, taken), path: path.to_owned(), data, kind, options })
+        let recipes = training::recipes(&self.args.training, &data, None, self.gpu.is_software())?;
+        Ok(NamedData { name: free_name(path, taken), path: path.to_owned(), data, recipes })
     }
 
     /// The run of a job: out of its file, or trained now and written there.
@@ -240,10 +254,10 @@ impl<'a> Runs<'a> {
     fn train(&self, job: &Job<'_>) -> anyhow::Result<Outcome> {
         let thorough = Evaluator::thorough(None)?;
         let at_marks = if job.is_thorough { thorough.clone() } else { Evaluator::psnr_only() };
-        let n_planned_steps = job.limits.steps.unwrap_or(job.options.n_planned_steps);
+        let Recipe { kind, options } = job.recipe.clone();
+        let n_planned_steps = job.limits.steps.unwrap_or(options.n_planned_steps);
         let plan = Plan {
-            kind: job.data.kind,
-            options: SplatOptions { n_planned_steps, ..job.options.clone() },
+            recipe: Recipe { kind, options: SplatOptions { n_planned_steps, ..options } },
             evaluators: Evaluators { at_marks, most_at_marks: usize::MAX, at_end: thorough },
             limits: job.limits,
             tell: if self.args.json { Tell::Nothing } else { Tell::Bar },
@@ -260,10 +274,10 @@ impl<'a> Runs<'a> {
         let n_test = data.of_split(Split::Test).len();
         Settings {
             data: job.data.path.clone(),
-            method: job.data.kind.name().to_owned(),
-            seed: job.options.seed,
-            max_splats: job.options.max_splats,
-            max_bytes: job.options.max_bytes,
+            method: job.recipe.kind.name().to_owned(),
+            seed: job.recipe.options.seed,
+            max_splats: job.recipe.options.max_splats,
+            max_bytes: job.recipe.options.max_bytes,
             seconds: job.limits.seconds,
             steps: job.limits.steps,
             scale: self.args.images.scale,
@@ -291,13 +305,14 @@ impl<'a> Runs<'a> {
         }
         let (end, kept) = (&run.end, if is_kept { ", done before" } else { "" });
         Ok(print::line(format_args!(
-            "run {} of {}  {:40} {:7.1} s  step {:6}  {:8} splats  {:.2} dB{kept}",
+            "run {} of {}  {:40} {:7.1} s  step {:6}  {:8} primitives  {:7.2} MB  {:.2} dB{kept}",
             self.n_done,
             self.n_all,
             run.name,
             end.seconds,
             end.step,
             end.primitives,
+            end.bytes as f64 / 1e6,
             run.psnr()
         ))?)
     }

@@ -107,7 +107,7 @@ fn linear_ticks(low: f64, high: f64) -> Vec<f64> {
     ticks
 }
 
-/// 1, 2 and 5 times powers of ten, or powers only where these are many.
+/// 1, 2 and 5 times powers of ten; powers only where these are many, all whole multiples where they are few.
 fn log_ticks(low: f64, high: f64) -> Vec<f64> {
     let mut powers = Vec::new();
     let mut power = 10.0_f64.powf(low.log10().floor());
@@ -117,6 +117,10 @@ fn log_ticks(low: f64, high: f64) -> Vec<f64> {
     }
     let all = powers.iter().flat_map(|power| [*power, 2.0 * power, 5.0 * power]);
     let all: Vec<f64> = all.filter(|tick| (low..=high).contains(tick)).collect();
+    if all.len() < 3 {
+        let multiples = powers.iter().flat_map(|power| (1..10).map(move |n| f64::from(n) * power));
+        return multiples.filter(|tick| (low..=high).contains(tick)).collect();
+    }
     if all.len() as f64 <= 2.0 * N_TICKS { all } else { powers.into_iter().filter(|tick| *tick >= low).collect() }
 }
 
@@ -152,6 +156,7 @@ mod tests {
         assert_eq!(labels(axis(Scale::Linear).span([21.0, 33.0].into_iter())), ["22", "24", "26", "28", "30", "32"]);
         let log = labels(axis(Scale::Log).span([1900.0, 70_000.0].into_iter()));
         assert_eq!(log, ["2k", "5k", "10k", "20k", "50k"]);
+        assert_eq!(labels(axis(Scale::Log).span([3.1, 7.4].into_iter())), ["4", "5", "6", "7"]);
         let flat = axis(Scale::Linear).span([24.0, 24.0].into_iter());
         assert!(flat.ticks.len() >= 3 && (flat.frac(24.0) - 0.5).abs() < 1e-9, "{flat:?}");
     }

@@ -10,6 +10,8 @@ use crate::print::{self, counted};
 use crate::splat_file;
 use anyhow::{Context, ensure};
 use std::path::{Path, PathBuf};
+use trainer::tsdf::TsdfModel;
+use trainer::tsdf::mesh::{Mesh, write_glb, write_ply};
 
 /// Flags of `export`.
 #[derive(Debug, clap::Args)]
@@ -20,9 +22,12 @@ pub(crate) struct Args {
     /// What to write
     #[arg(long, value_enum)]
     to: Format,
-    /// File (ply, spz) or new folder (nerfstudio) to write
+    /// File (ply, spz, glb) or folder (nerfstudio) to write; what is there already is refused
     #[arg(long, value_name = "PATH")]
     out: PathBuf,
+    /// Of a distance field, make the mesh coarser: one vertex per cell of this width, metres
+    #[arg(long, value_name = "M", value_parser = cell)]
+    cell_m: Option<f64>,
     /// Of a recording, export exactly the keyframes this `keyframes.txt` lists [default: those a run would accept]
     #[arg(long, value_name = "FILE")]
     keyframes: Option<PathBuf>,
@@ -31,48 +36,98 @@ pub(crate) struct Args {
 /// Formats there are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum Format {
-    /// Of a model: its splats as a .ply that other viewers open
+    /// Of a model: its splats, or the mesh of a distance field, as a .ply that other programs open
     Ply,
     /// Of a model: its splats as a .spz, a tenth as large; values are rounded
     Spz,
+    /// Of a distance field: its mesh as a .glb, y up
+    Glb,
     /// Of a recording: a folder with PNG photos, 16-bit depth, transforms.json with poses and split lists
     Nerfstudio,
 }
 
+impl Format {
+    /// The ending of its files; a folder has none.
+    fn ending(self) -> Option<&'static str> {
+        match self {
+            Self::Ply => Some("ply"),
+            Self::Spz => Some("spz"),
+            Self::Glb => Some("glb"),
+            Self::Nerfstudio => None,
+        }
+    }
+}
+
+fn cell(text: &str) -> Result<f64, String> {
+    let width_m = text.parse().ok().filter(|width_m: &f64| *width_m > 0.0 && width_m.is_finite());
+    width_m.ok_or_else(|| "expected a number above 0".to_owned())
+}
+
+/// What is there to be exported.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Contents {
+    Splats,
+    DistanceField,
+    NeuralField,
+    Recording,
+}
+
 /// Writes the model or recording and says what was written; a recording that ends early is a loss.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let is_model = splat_file::is_one(&args.from);
-    ensure!(args.from.exists(), BadArgument(format!("{} does not exist", args.from.display())));
-    match method::kind_in(&args.from)? {
-        Some(Kind::Tsdf) => {
-            return Err(wrong_kind(
-                "a distance field, which has no splats; its mesh is mesh.ply and mesh.glb there",
-                &args.from,
-            ));
+    let contents = contents(&args.from)?;
+    if args.cell_m.is_some() && contents != Contents::DistanceField {
+        return Err(BadArgument(format!("--cell-m: {} has no mesh", args.from.display())).into());
+    }
+    check_file(args)?;
+    match (args.to, contents) {
+        (Format::Ply, Contents::Splats) => export_splats(&args.from, splat_file::Format::Ply, &args.out),
+        (Format::Spz, Contents::Splats) => export_splats(&args.from, splat_file::Format::Spz, &args.out),
+        (Format::Ply | Format::Glb, Contents::DistanceField) => export_mesh(args),
+        (Format::Nerfstudio, Contents::Recording) => export_recording(args),
+        (Format::Glb, Contents::Splats) => {
+            Err(wrong_kind("splats, which have no mesh: glb is of a distance field", args))
         }
-        Some(Kind::Nerf) => return Err(wrong_kind("a neural field, which has no splats", &args.from)),
+        (Format::Spz, Contents::DistanceField) => {
+            Err(wrong_kind("a distance field, which has no splats but a mesh: ply or glb", args))
+        }
+        (_, Contents::NeuralField) => Err(wrong_kind("a neural field, which has neither splats nor a mesh", args)),
+        (Format::Ply | Format::Spz | Format::Glb, Contents::Recording) => {
+            Err(wrong_kind("splats and meshes are written of a model, this is a recording", args))
+        }
+        (Format::Nerfstudio, _) => Err(wrong_kind("nerfstudio is written of a recording, this is a model", args)),
+    }
+}
+
+fn contents(path: &Path) -> anyhow::Result<Contents> {
+    ensure!(path.exists(), BadArgument(format!("{} does not exist", path.display())));
+    match method::kind_in(path)? {
+        Some(Kind::Tsdf) => return Ok(Contents::DistanceField),
+        Some(Kind::Nerf) => return Ok(Contents::NeuralField),
         Some(Kind::Splat) | None => {}
     }
-    ensure!(is_model || args.from.is_file(), cannot_export(&args.from));
-    match (args.to, is_model) {
-        (Format::Ply, true) => export_splats(&args.from, splat_file::Format::Ply, &args.out),
-        (Format::Spz, true) => export_splats(&args.from, splat_file::Format::Spz, &args.out),
-        (Format::Nerfstudio, false) => export_recording(args),
-        (Format::Ply | Format::Spz, false) => {
-            Err(wrong_kind("splats are written of a model, this is a recording", &args.from))
-        }
-        (Format::Nerfstudio, true) => {
-            Err(wrong_kind("nerfstudio is written of a recording, this is a model", &args.from))
-        }
+    if splat_file::is_one(path) {
+        return Ok(Contents::Splats);
     }
+    let sentence = "neither a folder with a model, nor a file of splats, nor a recording";
+    ensure!(path.is_file(), BadArgument(format!("{}: {sentence}", path.display())));
+    Ok(Contents::Recording)
 }
 
-fn cannot_export(from: &Path) -> BadArgument {
-    BadArgument(format!("{}: neither a folder with splats.ply, nor a file of splats, nor a recording", from.display()))
+/// Refuses a file that is there already, or whose name says another format.
+fn check_file(args: &Args) -> Result<(), BadArgument> {
+    let Some(ending) = args.to.ending() else { return Ok(()) };
+    let out = args.out.display();
+    if !args.out.extension().is_some_and(|given| given.eq_ignore_ascii_case(ending)) {
+        return Err(BadArgument(format!("--out {out}: the name of such a file ends in .{ending}")));
+    }
+    if args.out.exists() {
+        return Err(BadArgument(format!("--out {out}: it is there already, name another file")));
+    }
+    Ok(())
 }
 
-fn wrong_kind(sentence: &str, from: &Path) -> anyhow::Error {
-    BadArgument(format!("{}: {sentence}", from.display())).into()
+fn wrong_kind(sentence: &str, args: &Args) -> anyhow::Error {
+    BadArgument(format!("{}: {sentence}", args.from.display())).into()
 }
 
 /// Checks the splats by reading them before they go out.
@@ -81,6 +136,21 @@ fn export_splats(model: &Path, format: splat_file::Format, out: &Path) -> anyhow
     splat_file::write(out, format, &splats)?;
     let n_splats = counted(splats.n_splats() as u64, "splat");
     print::line(format!("{n_splats} of colour degree {} -> {}", splats.sh_degree, out.display()))?;
+    Ok(Exit::Done)
+}
+
+/// Makes the mesh anew from the voxels.
+fn export_mesh(args: &Args) -> anyhow::Result<Exit> {
+    let mesh = TsdfModel::load(super::open_gpu()?, &args.from)?.mesh()?;
+    let coarser = args.cell_m.map(|cell_m| mesh.clustered(cell_m));
+    let written = coarser.as_ref().unwrap_or(&mesh);
+    match args.to {
+        Format::Glb => write_glb(&args.out, written)?,
+        _ => write_ply(&args.out, written)?,
+    }
+    let triangles = |mesh: &Mesh| counted(mesh.triangles.len() as u64, "triangle");
+    let of_all = if coarser.is_some() { format!(" in place of {}", triangles(&mesh)) } else { String::new() };
+    print::line(format!("{}{of_all} -> {}", triangles(written), args.out.display()))?;
     Ok(Exit::Done)
 }
 

@@ -1,7 +1,7 @@
 //! `fieldrig record`: what the devices say, into a file, and nothing else.
 
-use crate::config::{Override, Rig};
-use crate::exit::{self, Exit, LackOfEvidence};
+use crate::config::{ArmDriver, Override, Rig};
+use crate::exit::{self, BadArgument, Exit, LackOfEvidence};
 use crate::open::{self, Devices, Opened};
 use crate::print;
 use crate::stop::Stop;
@@ -25,7 +25,8 @@ pub(crate) struct Args {
     /// Simulate as fast as the machine can, without losing anything; else in real time
     #[arg(long, requires = "sim")]
     lockstep: bool,
-    /// Stop after S seconds of the devices' time [default: until Ctrl-C or the devices' end]
+    /// Stop after S seconds of the devices' time [default: until Ctrl-C or the devices' end; needed with --lockstep, unless
+    /// the rig file says when the simulation ends]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
     /// Print one JSON object a line
@@ -102,11 +103,24 @@ impl Recorded {
     }
 }
 
+/// Refuses a simulation that nothing holds back and nothing ends: it would fill the disk.
+fn check_end(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
+    let is_endless = args.seconds.is_none() && rig.sim.duration_secs.is_none() && rig.sim.n_images.is_none();
+    let is_simulated = args.sim || rig.arm.driver == ArmDriver::Sim;
+    if is_simulated && rig.sim.lockstep && is_endless {
+        return Err(BadArgument(
+            "a simulation in lockstep would go on until the disk is full: say with --seconds when it ends".into(),
+        ));
+    }
+    Ok(())
+}
+
 /// Records until the time is over, the devices end, or Ctrl-C.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let stop = Stop::on_ctrl_c()?;
     let overrides = if args.lockstep { vec![Override::new("sim.lockstep", true)] } else { Vec::new() };
     let rig = Rig::load(&args.rig_file, &overrides)?;
+    check_end(args, &rig)?;
     let Opened { rig, mut source, .. } = open::rig(rig, if args.sim { Devices::Sim } else { Devices::Real })?;
     let mut recorder = open::recorder(&args.out, &rig)?;
     let mut recorded = Recorded { event: "done", out: args.out.clone(), ..Recorded::default() };

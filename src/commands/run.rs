@@ -1,6 +1,7 @@
 //! `fieldrig run`: devices, join, trainer, picture.
 
 use crate::checkpoints::{CheckpointArgs, Checkpoints};
+use crate::clock::Clock;
 use crate::config::{ArmDriver, Override, Rig};
 use crate::decisions::{About, DecisionLog, Settings};
 use crate::evaluate::Evaluator;
@@ -8,18 +9,18 @@ use crate::exit::{self, BadArgument, Exit, LackOfEvidence};
 use crate::feed::{Feed, Input};
 use crate::join::{Counts, Join, Refusal, Use};
 use crate::live::{Live, LiveOptions, Pace};
-use crate::method::{self, Kind};
+use crate::method::{self, Recipe};
 use crate::open::{self, Devices, Opened};
-use crate::session::{Evaluators, Limits, Session, Tell};
+use crate::print;
+use crate::run_folder;
+use crate::session::{self, Ending, Evaluators, Limits, Session, Tell};
 use crate::stop::Stop;
 use crate::training_args::{Evidence, HowMany, Refine, TrainingArgs};
-use crate::{print, run_folder};
-use anyhow::Context;
 use drivers::Source;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::{Arc, OnceLock};
 use trainer::gpu::Gpu;
 use trainer::splat::SplatOptions;
@@ -57,7 +58,8 @@ pub(crate) struct Args {
     /// Address of the page, as numbers
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:7007", value_parser = address)]
     listen: SocketAddr,
-    /// Where the results and the settled rig file go; a folder that holds a model is refused [default: a new folder in runs]
+    /// Where the results and the settled rig file go, of several methods in a folder each inside; a folder that holds a model is
+    /// refused [default: a new folder in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
     #[command(flatten)]
@@ -101,46 +103,51 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     let stop = Stop::on_ctrl_c()?;
     let rig = Rig::load(&args.rig_file, &args.overrides())?;
-    let kind = Kind::of_rig(&rig)?;
-    args.training.check_for(kind)?;
+    let kinds = rig.train.methods.clone();
+    args.training.check_for(&kinds)?;
     let evidence = Evidence { joints: true, drifts: rig.has_moving_base(), depth: false }; // Depth comes, but not at the start.
-    args.training.check_learned(kind, evidence)?;
+    args.training.check_learned(&kinds, evidence)?;
     let pace = args.pace(&rig)?;
     let hub = Hub::new();
     let server = Server::start(ServerConfig { listen: args.listen }, hub.clone())?;
     args.tell_address(&server.url())?;
 
     let Opened { rig, source, damage } = args.open(rig)?;
-    let out = run_folder::make(args.out.as_deref())?;
-    rig.write_settled(&out).with_context(|| format!("cannot write into {}", out.display()))?;
+    let folders = run_folder::make_each(args.out.as_deref(), &kinds, Some(&rig))?;
     let feed = Feed::start(args.input(&rig, source)?, hub.clone(), stop.clone())?;
     let gpu = super::open_gpu()?;
     let notes = notes(&gpu);
     let cameras = args.training.refining(evidence, Refine::None)?.learn;
     let count = args.training.count(HowMany::ToCap);
     let options = SplatOptions { cameras, count, ..method::options(&rig.train, args.steps)? };
-    let method = kind.start(gpu.clone(), options.clone())?;
-    let about = About {
-        method: kind.name(),
-        data: args.record.as_deref().or(args.from.as_deref()),
-        adapter: gpu.describe(),
-        scale: rig.train.scale,
-        from_step: None,
-        options,
-    };
-    let decisions = DecisionLog::create(&out, Settings::new(about))?;
     let evaluators = Evaluators {
         at_marks: Evaluator::psnr_only(),
         most_at_marks: MOST_SCORED_AT_MARKS,
         at_end: Evaluator::thorough(None)?,
     };
     let limits = Limits { seconds: args.seconds, steps: args.steps };
-    let session = Session::new(gpu, method, evaluators, limits, Tell::of_command(args.json))
-        .with_checkpoints(Checkpoints::new(&out, args.checkpoints))
-        .with_decisions(decisions);
-    let options = LiveOptions { pace, method_name: kind.name(), start_keyframes: rig.join.start_keyframes, notes };
+    let clock = Clock::default();
+    let mut sessions = Vec::new();
+    for (kind, folder) in kinds.iter().copied().zip(&folders) {
+        let about = About {
+            method: kind.name(),
+            data: args.record.as_deref().or(args.from.as_deref()),
+            adapter: gpu.describe(),
+            scale: rig.train.scale,
+            from_step: None,
+            options: options.clone(),
+        };
+        let decisions = DecisionLog::create(folder, Settings::new(about))?;
+        let method = Recipe { kind, options: options.clone() }.start(gpu.clone())?;
+        let tell = Tell::of_command(args.json);
+        let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, tell)
+            .with_checkpoints(Checkpoints::new(folder, args.checkpoints))
+            .with_decisions(decisions);
+        sessions.push(if kinds.len() == 1 { session } else { session.among_others(clock.clone()) });
+    }
+    let options = LiveOptions { pace, start_keyframes: rig.join.start_keyframes, notes };
 
-    let mut live = Live::new(session, feed, hub, options);
+    let mut live = Live::new(sessions, feed, hub, options);
     while !stop.asked() && !live.is_over() {
         live.take_keyframes()?;
         live.step()?;
@@ -148,16 +155,18 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         live.publish()?;
     }
     stop.ask();
-    save(live, args, &rig, &out, &damage)
+    save(live, args, &rig, folders, &damage)
 }
 
 /// Saves what there is, then tells what went wrong on the way.
-fn save(live: Live, args: &Args, rig: &Rig, out: &Path, damage: &OnceLock<String>) -> anyhow::Result<Exit> {
+fn save(live: Live, args: &Args, rig: &Rig, folders: Vec<PathBuf>, damage: &OnceLock<String>) -> anyhow::Result<Exit> {
     let n_keyframes = live.keyframes().len();
     let n_train = live.keyframes().iter().filter(|keyframe| keyframe.split == Split::Train).count();
     let live_error_m = worst_position_error_m(live.keyframes());
-    run_folder::write_keyframe_list(&out.join("keyframes.txt"), live.keyframes())?;
-    let (session, leftover) = live.finish();
+    let (sessions, leftover) = live.finish();
+    for (session, folder) in sessions.iter().zip(&folders) {
+        run_folder::write_keyframe_list(&folder.join("keyframes.txt"), session.keyframes())?;
+    }
     let leftover = leftover?;
     let counts = leftover.join.counts();
     log::info!("{counts}");
@@ -166,20 +175,24 @@ fn save(live: Live, args: &Args, rig: &Rig, out: &Path, damage: &OnceLock<String
     let recording_error = leftover.recording_error.map(anyhow::Error::new);
     losses.extend(recording_error.map(|error| format!("the recording is cut off: {error:#}")));
     losses.extend(damage.get().cloned());
-    let particulars = Particulars {
-        method: Kind::of_rig(rig)?.name(),
-        seed: rig.train.seed,
-        keyframes: n_keyframes,
-        evicted: counts.evicted,
-        refused: counts.refused.iter().map(|(why, n)| (why.name(), *n)).collect(),
-        device_skipped: counts.device_skipped,
-        range_scans: leftover.join.range_scans().count(),
-        range_points: leftover.join.range_scans().map(|scan| scan.points_in_world_m.len()).sum(),
-        losses,
-        worst_position_error_m: live_error_m,
+    let ending = |(session, out): (Session, PathBuf)| Ending {
+        particulars: Particulars {
+            method: session.kind().name(),
+            seed: rig.train.seed,
+            keyframes: session.keyframes().len(),
+            evicted: counts.evicted,
+            refused: counts.refused.iter().map(|(why, n)| (why.name(), *n)).collect(),
+            device_skipped: counts.device_skipped,
+            range_scans: leftover.join.range_scans().count(),
+            range_points: leftover.join.range_scans().map(|scan| scan.points_in_world_m.len()).sum(),
+            losses: losses.clone(),
+            worst_position_error_m: live_error_m,
+        },
+        session,
+        out,
     };
     if n_train > 0 {
-        session.finish(out, &particulars)?;
+        session::finish(sessions.into_iter().zip(folders).map(ending).collect())?;
     }
     if let Some(error) = leftover.input_error {
         return Err(anyhow::Error::new(error).context("the devices broke off"));
@@ -187,7 +200,7 @@ fn save(live: Live, args: &Args, rig: &Rig, out: &Path, damage: &OnceLock<String
     if n_train == 0 {
         return Err(LackOfEvidence(nothing_to_train(n_keyframes, counts, rig)).into());
     }
-    Ok(exit::after(&particulars.losses))
+    Ok(exit::after(&losses))
 }
 
 impl Args {
@@ -278,6 +291,7 @@ fn notes(gpu: &Gpu) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::path::Path;
 
     #[test]
     fn a_run_without_a_model_says_why() {

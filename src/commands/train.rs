@@ -1,17 +1,18 @@
 //! `fieldrig train`: a model of a dataset folder or a recording.
 
 use crate::checkpoints::{self, CheckpointArgs, Checkpoints};
+use crate::clock::Clock;
 use crate::config::Rig;
 use crate::corrected_rig;
 use crate::data::{Data, DataArgs, Purpose};
 use crate::decisions::{About, DecisionLog, Settings};
 use crate::evaluate::Evaluator;
 use crate::exit::{self, BadArgument, Exit};
-use crate::method::{self, Resumed};
+use crate::method::{self, Kind, Recipe, Resumed};
 use crate::print;
 use crate::replay::Replay;
 use crate::run_folder;
-use crate::session::{Evaluators, Limits, Session, Tell};
+use crate::session::{self, Ending, Evaluators, Limits, Session, Tell};
 use crate::stop::Stop;
 use crate::training;
 use crate::training_args::TrainingArgs;
@@ -20,6 +21,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 use trainer::align::Alignment;
+use trainer::checkpoint::Checkpoint;
+use trainer::gpu::Gpu;
 use trainer::{Keyframe, Split};
 
 /// Length of a training where no flag says.
@@ -53,7 +56,7 @@ pub(crate) struct Args {
     /// Weights of LPIPS for `SqueezeNet` (safetensors) [default: what `FIELDRIG_LPIPS_WEIGHTS` names; none: no LPIPS]
     #[arg(long, value_name = "FILE")]
     lpips_weights: Option<PathBuf>,
-    /// Where the results go; a folder that holds a model is refused [default: the folder of --resume if it holds none, else a new one in runs]
+    /// Where the results go, of several methods in a folder each inside; a folder that holds a model is refused [default: the folder of --resume if it holds none, else a new one in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
     /// Write the recording's rig file here with what was found about its cameras, and the robot's description (robot.urdf) beside it
@@ -111,68 +114,69 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         corrected_rig::refuse_place(rig, file)?; // Not after all the training.
     }
     let gpu = super::open_gpu()?;
-    let Resumed { kind, mut method, options, rest } = match &checkpoint {
-        Some(checkpoint) => args.resumed(method::resume(gpu.clone(), checkpoint, &data.keyframes)?),
-        None => {
-            let (kind, options) = match &replay {
-                Some(replay) => (replay.kind, replay.decisions.settings.options.clone()),
-                None => training::model(&args.training, &data, args.plan_steps.or(args.steps), gpu.is_software())?,
-            };
-            let method = kind.start(gpu.clone(), options.clone())?;
-            Resumed { kind, method, options, rest: data.keyframes.clone() }
-        }
-    };
-    let from_step = checkpoint.is_some().then(|| method.n_taken()).transpose()?;
+    let mut models = args.models(&gpu, &data, replay.as_ref(), checkpoint.as_ref())?;
+    let from_step = checkpoint.is_some().then(|| models[0].method.n_taken()).transpose()?;
     if let Some(replay) = &replay {
         replay.check_start(from_step)?;
         replay.check_adapter(&gpu.describe());
     }
-    method.prepare()?;
-    let out = run_folder::make(args.out())?;
-    run_folder::write_keyframe_list(&out.join("keyframes.txt"), &data.keyframes)?;
-    if let Some(rig) = &data.rig {
-        rig.write_settled(&out)?;
-    }
+    models.iter_mut().try_for_each(|model| model.method.prepare())?;
+    let kinds: Vec<Kind> = models.iter().map(|model| model.recipe.kind).collect();
+    let folders = run_folder::make_each(args.out(), &kinds, data.rig.as_ref())?;
 
-    let about = About {
-        method: kind.name(),
-        data: Some(&args.data),
-        adapter: gpu.describe(),
-        scale: args.scale(&data, replay.as_ref()),
-        from_step,
-        options: options.clone(),
-    };
-    let mut decisions = DecisionLog::create(&out, Settings::new(about))?;
-    let is_new = |keyframe: &Arc<Keyframe>| rest.iter().any(|new| Arc::ptr_eq(new, keyframe));
-    for keyframe in data.keyframes.iter().filter(|keyframe| !is_new(keyframe)) {
-        decisions.had(from_step.unwrap_or_default(), keyframe);
-    }
-    let session = Session::new(gpu, method, evaluators, limits, Tell::of_command(args.json))
-        .with_checkpoints(Checkpoints::new(&out, args.checkpoints))
-        .with_profile(args.profile)
-        .with_decisions(decisions)
-        .going_on_after(checkpoint.map_or(0.0, |checkpoint| checkpoint.seconds));
-    let session = match &replay {
-        Some(replay) => replay.drive(session, &rest, &stop)?,
-        None => training::drive(session, &rest, &stop)?,
-    };
-
-    let alignment = session.alignment().cloned();
-    let startup_secs = session.clock_started().map_or(0.0, |at| (at - started).as_secs_f64());
-    session.finish(
-        &out,
-        &Particulars {
+    let rest = models[0].rest.clone(); // All begin with the same images; only one alone goes on from a checkpoint.
+    let is_rest = |keyframe: &Arc<Keyframe>| rest.iter().any(|other| Arc::ptr_eq(other, keyframe));
+    let clock = Clock::default();
+    let (mut sessions, mut seeds) = (Vec::new(), Vec::new());
+    for (Resumed { recipe: Recipe { kind, options }, method, .. }, folder) in models.into_iter().zip(&folders) {
+        run_folder::write_keyframe_list(&folder.join("keyframes.txt"), &data.keyframes)?;
+        seeds.push(options.seed);
+        let about = About {
             method: kind.name(),
+            data: Some(&args.data),
+            adapter: gpu.describe(),
+            scale: args.scale(&data, replay.as_ref()),
+            from_step,
+            options,
+        };
+        let mut decisions = DecisionLog::create(folder, Settings::new(about))?;
+        for keyframe in data.keyframes.iter().filter(|keyframe| !is_rest(keyframe)) {
+            decisions.had(from_step.unwrap_or_default(), keyframe);
+        }
+        let tell = Tell::of_command(args.json);
+        let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, tell)
+            .with_checkpoints(Checkpoints::new(folder, args.checkpoints))
+            .with_profile(args.profile)
+            .with_decisions(decisions);
+        sessions.push(match (&kinds[..], &checkpoint) {
+            ([_], Some(checkpoint)) => session.going_on_after(checkpoint.seconds),
+            ([_], None) => session,
+            _ => session.among_others(clock.clone()),
+        });
+    }
+    match &replay {
+        Some(replay) => replay.drive(&mut sessions[0], &rest, &stop)?,
+        None => training::drive(&mut sessions, &rest, &stop)?,
+    }
+
+    let alignment = sessions.iter().find_map(Session::alignment).cloned();
+    let startup_secs = sessions[0].clock_started().map_or(0.0, |at| (at - started).as_secs_f64());
+    let ending = |((session, out), seed): ((Session, PathBuf), u64)| Ending {
+        particulars: Particulars {
+            method: session.kind().name(),
             data: &args.data,
-            seed: options.seed,
+            seed,
             startup_secs,
             n_train: data.of_split(Split::Train).len(),
             n_selection: data.of_split(Split::Selection).len(),
             n_test: data.of_split(Split::Test).len(),
             losses: &data.losses,
-            alignment: alignment.clone(),
+            alignment: session.alignment().cloned(),
         },
-    )?;
+        session,
+        out,
+    };
+    session::finish(sessions.into_iter().zip(folders).zip(seeds).map(ending).collect())?;
     if let Some(file) = &args.write_rig {
         write_rig(&Data::rig_as_given(&args.data, &args.images)?, alignment.as_ref(), file)?;
     }
@@ -196,6 +200,28 @@ fn write_rig(rig: &Rig, alignment: Option<&Alignment>, file: &Path) -> anyhow::R
 }
 
 impl Args {
+    /// The models that learn, fresh or out of a checkpoint.
+    fn models(
+        &self,
+        gpu: &Arc<Gpu>,
+        data: &Data,
+        replay: Option<&Replay>,
+        checkpoint: Option<&Checkpoint>,
+    ) -> anyhow::Result<Vec<Resumed>> {
+        if let Some(checkpoint) = checkpoint {
+            return Ok(vec![self.resumed(method::resume(gpu.clone(), checkpoint, &data.keyframes)?)]);
+        }
+        let recipes = match replay {
+            Some(replay) => vec![replay.recipe()],
+            None => training::recipes(&self.training, data, self.plan_steps.or(self.steps), gpu.is_software())?,
+        };
+        let begin = |recipe: Recipe| {
+            let method = recipe.clone().start(gpu.clone())?;
+            Ok(Resumed { recipe, method, rest: data.keyframes.clone() })
+        };
+        recipes.into_iter().map(begin).collect()
+    }
+
     /// The folder asked for; a run that was cut off goes on in its own.
     fn out(&self) -> Option<&Path> {
         let unfinished = || self.resume.as_deref().filter(|folder| run_folder::refuse_model(folder).is_ok());
@@ -211,7 +237,7 @@ impl Args {
 
     /// Says what is not as the caller may expect.
     fn resumed(&self, resumed: Resumed) -> Resumed {
-        let (planned, step) = (resumed.options.n_planned_steps, resumed.method.progress().step);
+        let (planned, step) = (resumed.recipe.options.n_planned_steps, resumed.method.progress().step);
         log::info!("going on from step {step} of {planned} planned ones");
         if self.steps.is_some_and(|steps| steps > planned) {
             log::warn!("learning was planned to slow down over {planned} steps: those past them change little");

@@ -10,7 +10,9 @@ mod tests;
 mod write;
 
 pub(crate) use error::ConfigError;
+pub(crate) use write::methods;
 
+use crate::method::Kind;
 use kinematics::{Intrinsics, Transform};
 use std::net::SocketAddr;
 use std::ops::RangeInclusive;
@@ -220,7 +222,8 @@ pub(crate) struct JoinConfig {
 /// How the model is trained.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Train {
-    pub(crate) method: String,
+    /// At least one, all different.
+    pub(crate) methods: Vec<Kind>,
     pub(crate) max_splats: Option<u64>,
     pub(crate) max_bytes: Option<u64>,
     pub(crate) seed: u64,
@@ -303,6 +306,11 @@ impl Rig {
         self.arm.joint_offsets == other.arm.joint_offsets
             && self.cameras.len() == other.cameras.len()
             && self.cameras.iter().zip(&other.cameras).all(|(one, other)| is_same(one, other))
+    }
+
+    /// The same rig for one scene model.
+    pub(crate) fn with_method(&self, method: Kind) -> Self {
+        Self { train: Train { methods: vec![method], ..self.train.clone() }, ..self.clone() }
     }
 
     /// Writes the settled rig file and the robot's description into a folder, and says where the rig file is.

@@ -5,6 +5,7 @@ use super::{
     Arm, ArmDriver, Base, BaseDriver, Camera, CameraDriver, CameraSim, ConfigError, Depth, JoinConfig, MAX_BYTES,
     MAX_SPLATS, Measured, Override, Parent, Rig, SEED, Scanner, ScannerDriver, ScannerSim, Sim, Train, USUAL_SEED,
 };
+use crate::method::Kind;
 use kinematics::{Chain, Intrinsics, Lens, Transform};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -29,7 +30,7 @@ pub(super) const SCANNER_DRIVERS: [(&str, ScannerDriver); 2] =
     [("udp", ScannerDriver::Udp), ("sim", ScannerDriver::Sim)];
 pub(super) const PARENTS: [(&str, Parent); 3] =
     [("flange", Parent::Flange), ("base", Parent::Base), ("world", Parent::World)];
-const METHODS: [(&str, &str); 3] = [("splat", "splat"), ("nerf", "nerf"), ("tsdf", "tsdf")];
+const METHODS: [(&str, Kind); 3] = [("splat", Kind::Splat), ("nerf", Kind::Nerf), ("tsdf", Kind::Tsdf)];
 /// Where base poses and range scans are listened for where nothing says otherwise: of this computer only.
 const USUAL_BASE_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7009);
 const USUAL_SCANNER_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7010);
@@ -370,7 +371,7 @@ fn join(mut keys: Section<'_>) -> JoinConfig {
 
 fn train(mut keys: Section<'_>) -> Train {
     let train = Train {
-        method: keys.choice("method", &METHODS).unwrap_or("splat").to_owned(),
+        methods: keys.choices("method", &METHODS).unwrap_or_else(|| vec![Kind::Splat]),
         max_splats: keys.whole("max_splats", MAX_SPLATS),
         max_bytes: keys.whole("max_bytes", MAX_BYTES),
         seed: keys.whole("seed", SEED).unwrap_or(USUAL_SEED),

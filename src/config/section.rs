@@ -238,6 +238,20 @@ impl<'a> Section<'a> {
         found.map(|(_, choice)| *choice)
     }
 
+    /// One of a few words, or a list of different ones, if the key is there.
+    pub(super) fn choices<T: Copy + PartialEq>(&mut self, key: &'static str, choices: &[(&str, T)]) -> Option<Vec<T>> {
+        let value = self.take(key)?;
+        let words = value.as_array().map_or(std::slice::from_ref(&value), Vec::as_slice);
+        let choice = |word: &Value| choices.iter().find(|(name, _)| word.as_str() == Some(name)).map(|found| found.1);
+        let found: Vec<T> = words.iter().filter_map(choice).collect();
+        let is_repeated = (1..found.len()).any(|ix| found[..ix].contains(&found[ix]));
+        if found.is_empty() || found.len() < words.len() || is_repeated {
+            let names: Vec<_> = choices.iter().map(|(name, _)| format!("{name:?}")).collect();
+            return self.wrong(key, &value, &format!("{}, or a list of different ones", names.join(", ")));
+        }
+        Some(found)
+    }
+
     /// Says that a needed key is absent, unless its value was just found wrong.
     pub(super) fn missing(&self, key: &str, meaning: &'static str) {
         let key = join(&self.path, key);

@@ -49,7 +49,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a good value that differs from the one in force, and a value that is not allowed.
-const KEYS: [(&str, &str, &str); 105] = [
+const KEYS: [(&str, &str, &str); 108] = [
     ("arm.driver", "'franka'", "'frankka'"),
     ("arm.address", "'172.16.0.2'", "7"),
     ("arm.urdf", "'other.urdf'", "7"),
@@ -133,6 +133,9 @@ const KEYS: [(&str, &str, &str); 105] = [
     ("join.max_wait_millis", "100", "0"),
     ("join.max_range_scans", "50", "-1"),
     ("train.method", "'tsdf'", "'mesh'"),
+    ("train.method", "['tsdf', 'splat']", "['tsdf', 'tsdf']"),
+    ("train.method", "['splat', 'nerf']", "['splat', 'mesh']"),
+    ("train.method", "['nerf']", "[]"),
     ("train.max_splats", "1_500_000", "0"),
     ("train.max_bytes", "100_000_000", "1"),
     ("train.seed", "7", "-7"),

@@ -2,6 +2,7 @@
 
 use super::read::{ARM_DRIVERS, BASE_DRIVERS, CAMERA_DRIVERS, PARENTS, SCANNER_DRIVERS};
 use super::{Arm, Base, Camera, CameraSim, Depth, JoinConfig, Rig, Scanner, Sim, Train};
+use crate::method::Kind;
 use kinematics::{Intrinsics, Lens, Transform};
 use toml::{Table, Value};
 
@@ -159,13 +160,21 @@ fn join(join: &JoinConfig) -> Table {
 
 fn train(train: &Train) -> Table {
     table([
-        ("method", is(train.method.as_str())),
+        ("method", is(methods(&train.methods))),
         ("max_splats", train.max_splats.and_then(whole)),
         ("max_bytes", train.max_bytes.and_then(whole)),
         ("seed", whole(train.seed)),
         ("sh_degree", whole(train.sh_degree.into())),
         ("scale", is(train.scale)),
     ])
+}
+
+/// The value of `train.method`: a word, or a list of words where there are several.
+pub(crate) fn methods(methods: &[Kind]) -> Value {
+    match methods {
+        [one] => one.name().into(),
+        several => several.iter().map(|kind| kind.name()).collect::<Vec<_>>().into(),
+    }
 }
 
 fn sim(sim: &Sim) -> Table {

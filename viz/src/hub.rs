@@ -142,6 +142,11 @@ pub struct PendingRender {
 }
 
 impl PendingRender {
+    /// Which of several models to draw; the first if `None`. It is the client's word: there may be no such model.
+    pub fn method(&self) -> Option<&str> {
+        self.ticket.order.method.as_deref()
+    }
+
     /// Sends the drawn picture to the client; encoding happens on the server's side.
     pub fn deliver(mut self, picture: Picture) {
         let header = self.header(&picture);

@@ -17,6 +17,6 @@ mod session;
 
 pub use error::Error;
 pub use hub::{Hub, PendingRender};
-pub use news::{KeyframePose, LiveImage, LivePixels, SceneHint, Status};
+pub use news::{KeyframePose, LiveImage, LivePixels, ModelStatus, SceneHint, Status};
 pub use protocol::PROTOCOL_VERSION;
 pub use server::{Server, ServerConfig};

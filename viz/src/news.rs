@@ -13,10 +13,26 @@ const MAX_HISTORY: usize = 512;
 pub struct Status {
     /// One or two words for the operator, such as `waiting for images` or `training`.
     pub state: String,
-    /// `splat`, `nerf` or `tsdf`.
-    pub method: String,
     /// Wall time since the first image, seconds.
     pub seconds: f64,
+    /// Keyframes accepted and held.
+    pub keyframes: u64,
+    /// Images refused as keyframes, by reason.
+    pub refused: BTreeMap<String, u64>,
+    /// The model that is drawn for who does not say which.
+    #[serde(flatten)]
+    pub model: ModelStatus,
+    /// The models that learn beside it; empty where there is one.
+    pub others: Vec<ModelStatus>,
+    /// Sentences that an operator should read, such as a lost camera.
+    pub notes: Vec<String>,
+}
+
+/// Where a model stands.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct ModelStatus {
+    /// `splat`, `nerf` or `tsdf`.
+    pub method: String,
     /// Optimiser updates so far.
     pub step: u64,
     /// GPU time of a step, milliseconds, smoothed; `None` before the first.
@@ -25,25 +41,22 @@ pub struct Status {
     pub primitives: u64,
     /// Bytes of GPU memory the model holds.
     pub bytes: u64,
-    /// Keyframes accepted and held.
-    pub keyframes: u64,
-    /// Images refused as keyframes, by reason.
-    pub refused: BTreeMap<String, u64>,
     /// Mean over the test keyframes, decibel; `None` before the first evaluation.
     pub psnr: Option<f64>,
     /// `(seconds, psnr)` of every evaluation so far, in order.
     pub psnr_history: Vec<(f64, f64)>,
-    /// Sentences that an operator should read, such as a lost camera.
-    pub notes: Vec<String>,
 }
 
 impl Status {
-    /// The same status with a curve short enough to send several times a second; first and last point stay.
+    /// The same status with curves short enough to send several times a second; first and last points stay.
     pub(crate) fn thinned(mut self) -> Self {
-        let n = self.psnr_history.len();
-        if n > MAX_HISTORY {
-            let last = n - 1;
-            self.psnr_history = (0..MAX_HISTORY).map(|ix| self.psnr_history[ix * last / (MAX_HISTORY - 1)]).collect();
+        for model in std::iter::once(&mut self.model).chain(&mut self.others) {
+            let n = model.psnr_history.len();
+            if n > MAX_HISTORY {
+                let last = n - 1;
+                let kept = |ix: usize| model.psnr_history[ix * last / (MAX_HISTORY - 1)];
+                model.psnr_history = (0..MAX_HISTORY).map(kept).collect();
+            }
         }
         self
     }
@@ -116,17 +129,20 @@ pub(crate) struct LiveSlot {
 
 #[cfg(test)]
 mod tests {
-    use super::{MAX_HISTORY, Status};
+    use super::{MAX_HISTORY, ModelStatus, Status};
 
     #[test]
-    fn a_long_curve_is_thinned_and_keeps_its_ends() {
-        let psnr_history: Vec<_> = (0..5000).map(|ix| (f64::from(ix), f64::from(ix) * 0.5)).collect();
-        let status = Status { psnr_history, ..Status::default() }.thinned();
-        assert_eq!(status.psnr_history.len(), MAX_HISTORY);
-        assert_eq!(status.psnr_history.first(), Some(&(0.0, 0.0)));
-        assert_eq!(status.psnr_history.last(), Some(&(4999.0, 2499.5)));
-        assert!(status.psnr_history.windows(2).all(|pair| pair[0].0 < pair[1].0));
-        let short = Status { psnr_history: vec![(1.0, 2.0)], ..Status::default() };
-        assert_eq!(short.clone().thinned(), short);
+    fn long_curves_are_thinned_and_keep_their_ends() {
+        let with = |psnr_history: Vec<(f64, f64)>| ModelStatus { psnr_history, ..ModelStatus::default() };
+        let long = with((0..5000).map(|ix| (f64::from(ix), f64::from(ix) * 0.5)).collect());
+        let short = with(vec![(1.0, 2.0)]);
+        let status = Status { model: long.clone(), others: vec![short.clone(), long], ..Status::default() }.thinned();
+        assert_eq!(status.others[0], short);
+        for model in [&status.model, &status.others[1]] {
+            assert_eq!(model.psnr_history.len(), MAX_HISTORY);
+            assert_eq!(model.psnr_history.first(), Some(&(0.0, 0.0)));
+            assert_eq!(model.psnr_history.last(), Some(&(4999.0, 2499.5)));
+            assert!(model.psnr_history.windows(2).all(|pair| pair[0].0 < pair[1].0));
+        }
     }
 }

@@ -41,6 +41,8 @@ pub(crate) struct ClientGoodbye {}
 pub(crate) struct RenderMessage {
     /// The client's own number, repeated in the pictures.
     pub(crate) id: u64,
+    /// Which of several models; the first if absent.
+    pub(crate) method: Option<String>,
     /// Row major.
     pub(crate) world_from_camera: [f64; 16],
     /// Full size.

@@ -46,6 +46,8 @@ pub(crate) enum Malformed {
 pub(crate) struct RenderOrder {
     /// The client's own number.
     pub(crate) id: u64,
+    /// Which of several models; the first if `None`.
+    pub(crate) method: Option<String>,
     /// At full size.
     pub(crate) request: RenderRequest,
     /// Linear scales, in the order they are drawn.
@@ -68,6 +70,7 @@ impl RenderOrder {
             checked_range(message.near_m.unwrap_or(DEFAULT_NEAR_M), message.far_m.unwrap_or(DEFAULT_FAR_M))?;
         Ok(Self {
             id: message.id,
+            method: message.method.clone(),
             request: RenderRequest {
                 world_from_camera: rigid(&message.world_from_camera, "world_from_camera")?,
                 size_px,

@@ -15,7 +15,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use trainer::{Projection, RenderRequest};
-use viz::{Hub, KeyframePose, LiveImage, LivePixels, SceneHint, Server, ServerConfig, Status};
+use viz::{Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, SceneHint, Server, ServerConfig, Status};
 
 const WINDOW_PX: [u32; 2] = [1280, 760];
 /// Far more than two busy cores need to draw the page in software.
@@ -25,33 +25,41 @@ fn is_accent([red, green, blue]: [u8; 3]) -> bool {
     green >= red.saturating_add(30) && blue >= red.saturating_add(18)
 }
 
+/// A request, and the model that it is for.
+type Asked = (RenderRequest, Option<String>);
+
 /// Draws requests on its own thread and keeps them, as a training thread would serve them.
 struct Painter {
-    requests: Arc<Mutex<Vec<RenderRequest>>>,
+    asked: Arc<Mutex<Vec<Asked>>>,
     stop: Arc<AtomicBool>,
     thread: Option<std::thread::JoinHandle<()>>,
 }
 
 impl Painter {
     fn start(hub: Hub) -> Self {
-        let requests: Arc<Mutex<Vec<RenderRequest>>> = Arc::default();
+        let asked: Arc<Mutex<Vec<Asked>>> = Arc::default();
         let stop: Arc<AtomicBool> = Arc::default();
-        let (seen, stopped) = (Arc::clone(&requests), Arc::clone(&stop));
+        let (seen, stopped) = (Arc::clone(&asked), Arc::clone(&stop));
         let thread = std::thread::spawn(move || {
             while !stopped.load(Ordering::Relaxed) {
                 hub.wait_for_request(Duration::from_millis(50));
                 if let Some(pending) = hub.next_request() {
-                    seen.lock().expect("no panic holds it").push(pending.request.clone());
+                    let order = (pending.request.clone(), pending.method().map(str::to_owned));
+                    seen.lock().expect("no panic holds it").push(order);
                     let picture = draw(&pending.request);
                     pending.deliver(picture);
                 }
             }
         });
-        Self { requests, stop, thread: Some(thread) }
+        Self { asked, stop, thread: Some(thread) }
     }
 
     fn requests(&self) -> Vec<RenderRequest> {
-        self.requests.lock().expect("no panic holds it").clone()
+        self.asked.lock().expect("no panic holds it").iter().map(|(request, _)| request.clone()).collect()
+    }
+
+    fn methods(&self) -> Vec<Option<String>> {
+        self.asked.lock().expect("no panic holds it").iter().map(|(_, method)| method.clone()).collect()
     }
 }
 
@@ -109,16 +117,19 @@ fn tell_news(hub: &Hub) {
     let curve = |ix: u32| (f64::from(ix) * 2.0, 27.0 - 14.0 * (-f64::from(ix) / 12.0).exp());
     hub.set_status(Status {
         state: "training".to_owned(),
-        method: "splat".to_owned(),
         seconds: 98.4,
-        step: 1520,
-        step_millis: Some(41.7),
-        primitives: 84_512,
-        bytes: 61_210_112,
         keyframes: 143,
         refused: BTreeMap::from([("too little motion".to_owned(), 812), ("blurred".to_owned(), 31)]),
-        psnr: Some(26.76),
-        psnr_history: (0..50).map(curve).collect(),
+        model: ModelStatus {
+            method: "splat".to_owned(),
+            step: 1520,
+            step_millis: Some(41.7),
+            primitives: 84_512,
+            bytes: 61_210_112,
+            psnr: Some(26.76),
+            psnr_history: (0..50).map(curve).collect(),
+        },
+        others: vec![ModelStatus { method: "tsdf".to_owned(), step: 143, ..ModelStatus::default() }],
         notes: Vec::new(),
     });
 }
@@ -152,6 +163,7 @@ fn the_page_shows_the_scene_where_it_is() {
     let first_view = Translation3::new(0.0, 0.0, 0.3) * looking_along_y();
     assert!((full.world_from_camera.inverse() * first_view).translation.vector.norm() < 1e-6, "starts at the hint");
 
+    check_switch(&mut browser, &painter);
     check_live_frustum(&mut browser, &full);
     check_picture(&mut browser, &full);
     let turned = check_drag(&mut browser, &painter, &full);
@@ -162,6 +174,21 @@ fn the_page_shows_the_scene_where_it_is() {
     drop(browser);
     drop(painter);
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
+}
+
+/// Another model's button asks for its pictures and shows its figures.
+fn check_switch(browser: &mut Browser, painter: &Painter) {
+    let press = |browser: &mut Browser, method: &str| {
+        browser.evaluate(&format!("document.querySelector('#models button[data-method={method}]').click()"));
+    };
+    assert!(painter.methods().iter().all(Option::is_none), "nobody chose");
+    press(browser, "tsdf");
+    wait_for(browser, "the other model's figures", |browser| browser.text("primitives-name") == "Voxel blocks");
+    wait_for(browser, "its picture", |_| painter.methods().last() == Some(&Some("tsdf".to_owned())));
+    press(browser, "splat");
+    wait_for(browser, "the first model's picture", |_| painter.methods().last() == Some(&Some("splat".to_owned())));
+    wait_for(browser, "a full picture of it", |browser| browser.text("picture-text").contains("100 %"));
+    assert_eq!(browser.text("primitives-name"), "Splats");
 }
 
 /// The live camera's frustum is drawn where the request's projection puts it.

@@ -12,7 +12,10 @@ use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use viz::{Error, Hub, KeyframePose, LiveImage, LivePixels, PendingRender, SceneHint, Server, ServerConfig, Status};
+use viz::{
+    Error, Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, PendingRender, SceneHint, Server, ServerConfig,
+    Status,
+};
 
 /// Far more than loopback needs; a test that waits this long has failed.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -50,10 +53,9 @@ fn a_client_is_greeted_with_the_version_and_told_the_news() {
     let (hub, server) = start();
     hub.set_status(Status {
         state: "training".to_owned(),
-        step: 1200,
-        psnr: Some(24.5),
-        psnr_history: vec![(1.0, 20.0), (2.0, 24.5)],
         refused: [("blurred".to_owned(), 3)].into(),
+        model: ModelStatus { psnr: Some(24.5), psnr_history: vec![(1.0, 20.0), (2.0, 24.5)], ..learned("splat", 1200) },
+        others: vec![learned("tsdf", 30)],
         ..Status::default()
     });
     hub.set_scene_hint(SceneHint {
@@ -78,10 +80,38 @@ fn a_client_is_greeted_with_the_version_and_told_the_news() {
     assert_eq!((&status["step"], &status["psnr"]), (&json!(1200), &json!(24.5)));
     assert_eq!(status["psnr_history"], json!([[1.0, 20.0], [2.0, 24.5]]));
     assert_eq!(status["refused"], json!({"blurred": 3}));
+    assert_eq!((&status["others"][0]["method"], &status["others"][0]["step"]), (&json!("tsdf"), &json!(30)));
     let keyframes = client.text_of("keyframes");
     assert_eq!(keyframes["keyframes"][0]["focal_px"], json!([600.0, 601.0]));
-    hub.set_status(Status { step: 1300, ..Status::default() });
-    assert_eq!(client.text_of("status")["step"], json!(1300));
+    hub.set_status(Status { model: learned("splat", 1300), ..Status::default() });
+    let status = client.text_of("status");
+    assert_eq!((&status["step"], &status["others"]), (&json!(1300), &json!([])));
+}
+
+/// A model that made so many steps.
+fn learned(method: &str, step: u64) -> ModelStatus {
+    ModelStatus { method: method.to_owned(), step, ..ModelStatus::default() }
+}
+
+#[test]
+fn a_client_says_which_of_several_models_it_wants_to_see() {
+    let (hub, server) = start();
+    let mut client = Client::connect(server.address());
+    let mut message = render_message(1);
+    message["stages"] = json!([1.0]);
+    client.say(&message);
+    let pending = next(&hub);
+    assert_eq!(pending.method(), None, "the first");
+    pending.fail("nothing was seen yet");
+    assert_eq!(client.text_of("error")["id"], json!(1));
+    message["id"] = json!(2);
+    message["method"] = json!("tsdf");
+    client.say(&message);
+    let pending = next(&hub);
+    assert_eq!(pending.method(), Some("tsdf"));
+    let picture = draw(&pending.request);
+    pending.deliver(picture);
+    assert_eq!(client.binary_of("picture").0["id"], json!(2));
 }
 
 #[test]
@@ -299,7 +329,7 @@ fn every_field_on_the_wire_is_in_the_docs_and_known_to_the_page() {
 /// One message of each type that the server sends.
 fn one_of_each() -> Vec<Value> {
     let (hub, server) = start();
-    hub.set_status(Status::default());
+    hub.set_status(Status { others: vec![learned("tsdf", 30)], ..Status::default() });
     hub.set_scene_hint(SceneHint { center_m: [0.0; 3], radius_m: 1.0, world_from_camera: Transform::identity() });
     hub.set_live_image(LiveImage {
         camera: "wrist".into(),
@@ -370,7 +400,7 @@ fn a_taken_port_and_a_public_address_are_refused_in_one_sentence() {
 #[test]
 fn the_page_and_the_status_are_served_over_http() {
     let (hub, server) = start();
-    hub.set_status(Status { step: 77, ..Status::default() });
+    hub.set_status(Status { model: learned("splat", 77), ..Status::default() });
     let page = get(server.address(), "/", "localhost");
     assert!(page.starts_with("HTTP/1.1 200") && page.contains("fieldrig"), "{page}");
     let status = get(server.address(), "/status", "localhost");

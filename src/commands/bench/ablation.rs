@@ -5,6 +5,7 @@ use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
 use crate::bench::statistics::{median, sample_std};
 use crate::bench::variant::{CAMERAS_AS_GIVEN, Variant};
 use crate::exit::{self, BadArgument, Exit};
+use crate::method::{Kind, Recipe};
 use crate::training;
 use serde::Serialize;
 use std::collections::HashSet;
@@ -78,10 +79,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let limits = training::limits(args.seconds, args.steps, USUAL_SECONDS)?;
     let mut runs = Runs::open(&args.bench, crate::commands::open_gpu()?)?;
     let data = runs.load(&args.data, &mut HashSet::new())?;
-    data.expect_splats()?;
+    let usual = data.splats()?;
     let asked = |change: &&Variant| args.only.is_empty() || args.only.iter().any(|word| change.name.contains(word));
-    let changes: Vec<&Variant> =
-        CHANGES.iter().filter(|change| is_change(change, &data.options)).filter(asked).collect();
+    let changes: Vec<&Variant> = CHANGES.iter().filter(|change| is_change(change, usual)).filter(asked).collect();
     if changes.is_empty() {
         let names: Vec<&str> = CHANGES.iter().map(|change| change.name).collect();
         return Err(BadArgument(format!("--only: none of the rows is named so: {}", names.join(", "))).into());
@@ -95,11 +95,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut page = None;
     for change in std::iter::once(&WHOLE).chain(changes) {
         let mut finished = Vec::new();
-        for seed in data.options.seed..data.options.seed.saturating_add(args.seeds) {
+        for seed in usual.seed..usual.seed.saturating_add(args.seeds) {
             finished.push(runs.run(Job {
                 name: format!("ablation {} {} seed {seed}", data.name, change.name),
                 data: &data,
-                options: change.options(&SplatOptions { seed, ..data.options.clone() }),
+                recipe: Recipe { kind: Kind::Splat, options: change.options(&SplatOptions { seed, ..usual.clone() }) },
                 limits,
                 disturbed: None,
                 variant: Some(change.name.to_owned()),
@@ -193,7 +193,7 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, rows: &[Changed]) ->
         numbers: serde_json::json!({
             "bench": "ablation",
             "data": data.path,
-            "method": data.kind.name(),
+            "method": Kind::Splat.name(),
             "adapter": runs.adapter(),
             "changes": rows,
         }),

@@ -5,6 +5,7 @@ use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
 use crate::bench::statistics::{db_per_doubling, extent, median};
 use crate::chart::{Axis, Chart, Line, Point, Rule, Scale};
 use crate::exit::{self, BadArgument, Exit};
+use crate::method::{Kind, Recipe};
 use crate::training;
 use serde::Serialize;
 use std::collections::HashSet;
@@ -82,21 +83,24 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut runs = Runs::open(&args.bench, crate::commands::open_gpu()?)?;
     runs.expect(caps.len() * usize::try_from(args.seeds)?);
     let data = runs.load(&args.data, &mut HashSet::new())?;
-    data.expect_splats()?;
+    let usual = data.splats()?;
     let mut capped = Vec::new();
     let mut page = None;
     for cap in caps {
         let mut finished = Vec::new();
         let cap_name = cap.map_or_else(|| "no cap".to_owned(), |cap| format!("cap {cap}"));
-        for seed in data.options.seed..data.options.seed.saturating_add(args.seeds) {
+        for seed in usual.seed..usual.seed.saturating_add(args.seeds) {
             let (max_splats, count) = match cap {
                 Some(cap) => (cap, CountChoice::ToCap),
-                None => (data.options.max_splats, CountChoice::Tested),
+                None => (usual.max_splats, CountChoice::Tested),
             };
             finished.push(runs.run(Job {
                 name: format!("budget {} {cap_name} seed {seed}", data.name),
                 data: &data,
-                options: SplatOptions { seed, max_splats, count, ..data.options.clone() },
+                recipe: Recipe {
+                    kind: Kind::Splat,
+                    options: SplatOptions { seed, max_splats, count, ..usual.clone() },
+                },
                 limits,
                 disturbed: None,
                 variant: None,
@@ -152,7 +156,7 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -
     } else {
         "one run a cap".to_owned()
     };
-    let subtitle = format!("{}, {}, {length}; {spread}", data.name, data.kind.name());
+    let subtitle = format!("{}, splat, {length}; {spread}", data.name);
     let x = |label: &str| Axis { label: label.to_owned(), scale: Scale::Log, ticks: Vec::new() };
     let line = |label: &str, points: Vec<Point>| Line { label: label.to_owned(), points, is_foreign: false };
     let own_point = own.map(Capped::point);
@@ -203,7 +207,7 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -
                 "Each point is a model trained for {length} under a cap on its splats and scored on held-out images; \
                  the run without a cap shows what the trainer takes by itself (at most {}): halved as long as \
                  that costs less than {PAYS_DB} dB on images held back for it.",
-                data.options.max_splats
+                data.splats()?.max_splats
             ),
             format!("A doubling of the splats that gains less than {PAYS_DB} dB does not pay."),
             format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),
@@ -213,7 +217,7 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -
         numbers: serde_json::json!({
             "bench": "budget",
             "data": data.path,
-            "method": data.kind.name(),
+            "method": Kind::Splat.name(),
             "adapter": runs.adapter(),
             "own_choice": own,
             "caps": by_cap,

@@ -6,6 +6,7 @@ use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
 use crate::bench::statistics::{extent, median, sample_std, secs_to};
 use crate::chart::{Axis, Chart, Line, Point, Scale, short};
 use crate::exit::{self, BadArgument, Exit};
+use crate::method::{Kind, Recipe};
 use crate::{marks, training};
 use serde::Serialize;
 use std::collections::{BTreeMap, HashSet};
@@ -20,13 +21,13 @@ const USUAL_SECONDS: f64 = 60.0;
 /// Flags of `bench curve`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Nerfstudio or TUM RGB-D folders, or recordings (.mcap); each becomes a line
+    /// Nerfstudio or TUM RGB-D folders, or recordings (.mcap); each becomes a line a method
     #[arg(required = true)]
     data: Vec<PathBuf>,
     /// Length of a run in seconds of training; loading and scoring do not count
     #[arg(long, value_name = "S", default_value_t = USUAL_SECONDS)]
     seconds: f64,
-    /// Runs of each data set, 1 to 1000, with seeds counted up from --seed
+    /// Runs of each line, 1 to 1000, with seeds counted up from --seed
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u64).range(1..=1000))]
     seeds: u64,
     /// A curve that another trainer measured: JSON with rows of seconds and psnr; may be given several times
@@ -36,10 +37,12 @@ pub(crate) struct Args {
     bench: BenchArgs,
 }
 
-/// One data set, or one peer.
+/// One method on one data set, or one peer.
 #[derive(Debug, Serialize)]
 struct Measured {
     label: String,
+    /// Of ours.
+    method: Option<&'static str>,
     is_peer: bool,
     /// PSNR at the marks.
     points: Vec<Mark>,
@@ -66,11 +69,24 @@ struct Summary {
     psnr: Option<f64>,
     /// Over the runs, dB.
     psnr_std: Option<f64>,
+    /// Median at the end: a method that has learned all there is ends before its time is over.
+    seconds: Option<f64>,
     primitives: Option<f64>,
     primitives_extent: Option<[f64; 2]>,
     /// Standard deviation over mean.
     primitives_spread: Option<f64>,
+    /// Median at the end.
+    bytes: Option<f64>,
     seconds_to: Vec<Reached>,
+}
+
+/// What the runs of a line came to.
+#[derive(Debug, Default)]
+struct Ends {
+    psnr: Vec<f64>,
+    seconds: Vec<f64>,
+    primitives: Vec<f64>,
+    bytes: Vec<f64>,
 }
 
 /// When a quality was reached.
@@ -89,30 +105,33 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     let peers = args.peer.iter().map(|path| Peer::load(path)).collect::<Result<Vec<_>, _>>()?;
     let mut runs = Runs::open(&args.bench, crate::commands::open_gpu()?)?;
-    runs.expect(args.data.len() * usize::try_from(args.seeds)?);
-    let mut measured: Vec<Measured> = Vec::new();
+    let mut bench = Bench { args, peers, measured: Vec::new(), notes: Vec::new() };
     let (mut losses, mut names) = (Vec::new(), HashSet::new());
     let mut page = None;
-    for path in &args.data {
+    for (path, n_left) in args.data.iter().zip((1..=args.data.len()).rev()) {
         let data = runs.load(path, &mut names)?;
         losses.extend(data.data.losses.iter().cloned());
-        measured.push(Measured::of_runs(&data, Vec::new()));
-        let mut finished = Vec::new();
-        for seed in data.options.seed..data.options.seed.saturating_add(args.seeds) {
-            finished.push(runs.run(Job {
-                name: format!("curve {} seed {seed}", data.name),
-                data: &data,
-                options: SplatOptions { seed, ..data.options.clone() },
-                limits,
-                disturbed: None,
-                variant: None,
-                keyframes: &|| data.data.keyframes.clone(),
-                is_thorough: true,
-            })?);
-            // Written after every run, so that an interrupted bench shows what it has.
-            measured.pop();
-            measured.push(Measured::of_runs(&data, finished.clone()));
-            page = Some(findings(args, &runs, &measured, &peers)?);
+        let recipes = bench.fitting(&data);
+        runs.expect(n_left * recipes.len() * usize::try_from(args.seeds)?);
+        for recipe in recipes {
+            let mut finished = Vec::new();
+            bench.measured.push(Measured::of_runs(&data, recipe.kind, Vec::new()));
+            for seed in recipe.options.seed..recipe.options.seed.saturating_add(args.seeds) {
+                finished.push(runs.run(Job {
+                    name: format!("curve {} {} seed {seed}", data.name, recipe.kind.name()),
+                    data: &data,
+                    recipe: Recipe { kind: recipe.kind, options: SplatOptions { seed, ..recipe.options.clone() } },
+                    limits,
+                    disturbed: None,
+                    variant: None,
+                    keyframes: &|| data.data.keyframes.clone(),
+                    is_thorough: true,
+                })?);
+                // Written after every run, so that an interrupted bench shows what it has.
+                bench.measured.pop();
+                bench.measured.push(Measured::of_runs(&data, recipe.kind, finished.clone()));
+                page = Some(bench.findings(&runs)?);
+            }
         }
     }
     if let Some((findings, page)) = page {
@@ -122,15 +141,20 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 impl Measured {
-    fn of_runs(data: &NamedData, runs: Vec<Run>) -> Self {
+    fn of_runs(data: &NamedData, kind: Kind, runs: Vec<Run>) -> Self {
         let curves: Vec<Vec<(f64, f64)>> = runs.iter().map(Run::curve).collect();
-        let sizes: Vec<f64> = runs.iter().map(|run| run.end.primitives as f64).collect();
-        let ends: Vec<f64> = runs.iter().map(Run::psnr).collect();
+        let ends = Ends {
+            psnr: runs.iter().map(Run::psnr).collect(),
+            seconds: runs.iter().map(|run| run.end.seconds).collect(),
+            primitives: runs.iter().map(|run| run.end.primitives as f64).collect(),
+            bytes: runs.iter().map(|run| run.end.bytes as f64).collect(),
+        };
         Self {
-            label: format!("{}, {}", data.name, data.kind.name()),
+            label: format!("{}, {}", data.name, kind.name()),
+            method: Some(kind.name()),
             is_peer: false,
             points: at_marks(&curves),
-            summary: Summary::of(&curves, &ends, &sizes),
+            summary: Summary::of(&curves, &ends),
             runs,
         }
     }
@@ -138,13 +162,18 @@ impl Measured {
     fn of_peer(peer: &Peer) -> Self {
         let curves = vec![peer.curve()];
         let last = peer.rows.last();
-        let ends: Vec<f64> = last.map(|row| row.psnr).into_iter().collect();
-        let sizes: Vec<f64> = last.and_then(|row| row.n).map(|n| n as f64).into_iter().collect();
+        let ends = Ends {
+            psnr: last.map(|row| row.psnr).into_iter().collect(),
+            seconds: last.map(|row| row.seconds).into_iter().collect(),
+            primitives: last.and_then(|row| row.n).map(|n| n as f64).into_iter().collect(),
+            bytes: last.and_then(|row| row.bytes).map(|bytes| bytes as f64).into_iter().collect(),
+        };
         Self {
             label: peer.label.clone(),
+            method: None,
             is_peer: true,
             points: at_marks(&curves),
-            summary: Summary::of(&curves, &ends, &sizes),
+            summary: Summary::of(&curves, &ends),
             runs: Vec::new(),
         }
     }
@@ -153,6 +182,14 @@ impl Measured {
         let point =
             |mark: &Mark| Point { x: mark.seconds, y: mark.psnr, low: mark.lowest_psnr, high: mark.highest_psnr };
         Line { label: self.label.clone(), points: self.points.iter().map(point).collect(), is_foreign: self.is_peer }
+    }
+
+    /// Its end over the size of the model; without a point where that is not known.
+    fn size_line(&self) -> Line {
+        let Summary { psnr, bytes, .. } = self.summary;
+        let megabytes = bytes.map(|bytes| bytes / 1e6).filter(|megabytes| *megabytes > 0.0);
+        let point = megabytes.zip(psnr).map(|(x, y)| Point { x, y, low: y, high: y });
+        Line { label: self.label.clone(), points: point.into_iter().collect(), is_foreign: self.is_peer }
     }
 }
 
@@ -182,19 +219,21 @@ fn at_marks(curves: &[Vec<(f64, f64)>]) -> Vec<Mark> {
 }
 
 impl Summary {
-    fn of(curves: &[Vec<(f64, f64)>], ends: &[f64], sizes: &[f64]) -> Self {
+    fn of(curves: &[Vec<(f64, f64)>], ends: &Ends) -> Self {
         let reached = |wanted_db: f64| {
             let seconds: Vec<f64> = curves.iter().filter_map(|curve| secs_to(curve, wanted_db)).collect();
             Reached { psnr: wanted_db, seconds: median(&seconds), n_runs: seconds.len() }
         };
-        let mean_size = sizes.iter().sum::<f64>() / sizes.len().max(1) as f64;
+        let mean_size = ends.primitives.iter().sum::<f64>() / ends.primitives.len().max(1) as f64;
         Self {
             n_runs: curves.len(),
-            psnr: median(ends),
-            psnr_std: sample_std(ends),
-            primitives: median(sizes),
-            primitives_extent: extent(sizes),
-            primitives_spread: sample_std(sizes).map(|std| std / mean_size),
+            psnr: median(&ends.psnr),
+            psnr_std: sample_std(&ends.psnr),
+            seconds: median(&ends.seconds),
+            primitives: median(&ends.primitives),
+            primitives_extent: extent(&ends.primitives),
+            primitives_spread: sample_std(&ends.primitives).map(|std| std / mean_size),
+            bytes: median(&ends.bytes),
             seconds_to: WANTED_DB.map(reached).into(),
         }
     }
@@ -204,10 +243,11 @@ impl Summary {
             value.map_or_else(|| "-".to_owned(), |value| format!("{value:.digits$}"))
         };
         let mut row = vec![label.to_owned(), self.n_runs.to_string(), number(self.psnr, 2), number(self.psnr_std, 3)];
-        row.push(number(self.primitives, 0));
+        row.extend([number(self.seconds, 2), number(self.primitives, 0)]);
         let spread = self.primitives_extent.filter(|_| self.n_runs > 1);
         row.push(spread.map_or_else(|| "-".to_owned(), |[low, high]| format!("{low:.0} to {high:.0}")));
         row.push(number(self.primitives_spread.map(|share| 100.0 * share), 2));
+        row.push(number(self.bytes.map(|bytes| bytes / 1e6), 2));
         row.extend(self.seconds_to.iter().map(|reached| match reached.seconds {
             None => "not reached".to_owned(),
             Some(seconds) if reached.n_runs == self.n_runs => format!("{seconds:.2} s"),
@@ -217,67 +257,106 @@ impl Summary {
     }
 }
 
-/// Everything known so far, written.
-fn findings(
-    args: &Args,
-    runs: &Runs<'_>,
-    measured: &[Measured],
-    peers: &[Peer],
-) -> anyhow::Result<(Findings, PathBuf)> {
-    let peers: Vec<Measured> = peers.iter().map(Measured::of_peer).collect();
-    let all = || measured.iter().chain(&peers);
-    let last_secs = all().flat_map(|measured| &measured.points).map(|point| point.seconds).fold(1.0, f64::max);
-    let (n_seeds, seconds) = (args.seeds, short(args.seconds));
-    let subtitle = if n_seeds > 1 {
-        format!("median of {n_seeds} seeds; band: lowest to highest; dashed: peers")
-    } else {
-        "one run a line; dashed: peers".to_owned()
-    };
-    let chart = Chart {
-        title: "PSNR of held-out images over time".into(),
-        subtitle,
-        x: Axis {
-            label: "seconds of training (log)".into(),
-            scale: Scale::Log,
-            ticks: marks::up_to(1.1 * last_secs).collect(),
-        },
-        y: Axis { label: "test PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() },
-        lines: all().map(Measured::line).collect(),
-        floors: Vec::new(),
-        rules: Vec::new(),
-    };
-    let head = ["data, method", "runs", "PSNR, dB", "std, dB", "splats", "splats, extent", "spread, %"];
-    let head = head.map(str::to_owned).into_iter().chain(WANTED_DB.map(|wanted_db| format!("to {wanted_db} dB")));
-    let table = Table {
-        title: format!("After {seconds} s (peers: after their last row)"),
-        head: head.collect(),
-        rows: all().map(|measured| measured.summary.row(&measured.label)).collect(),
-    };
-    let findings = Findings {
-        name: "curve",
-        title: "Accuracy over time".into(),
-        sentences: vec![
+/// What is known so far.
+struct Bench<'a> {
+    args: &'a Args,
+    peers: Vec<Peer>,
+    measured: Vec<Measured>,
+    /// Sentences for the page.
+    notes: Vec<String>,
+}
+
+impl Bench<'_> {
+    /// The methods that have something to learn from in these data. Where there is but one, it says itself what it lacks.
+    fn fitting<'a>(&mut self, data: &'a NamedData) -> Vec<&'a Recipe> {
+        let (fitting, lacking): (Vec<_>, Vec<_>) =
+            data.recipes.iter().partition(|recipe| data.data.has_depth() || recipe.kind != Kind::Tsdf);
+        if fitting.is_empty() {
+            return lacking;
+        }
+        for recipe in lacking {
+            let note =
+                format!("{} has no depth, which {} is made of: it has no such line", data.name, recipe.kind.name());
+            log::warn!("{note}");
+            self.notes.push(note + ".");
+        }
+        fitting
+    }
+
+    /// Everything known so far, written.
+    fn findings(&self, runs: &Runs<'_>) -> anyhow::Result<(Findings, PathBuf)> {
+        let peers: Vec<Measured> = self.peers.iter().map(Measured::of_peer).collect();
+        let all = || self.measured.iter().chain(&peers);
+        let last_secs = all().flat_map(|measured| &measured.points).map(|point| point.seconds).fold(1.0, f64::max);
+        let (n_seeds, seconds) = (self.args.seeds, short(self.args.seconds));
+        let subtitle = if n_seeds > 1 {
+            format!("median of {n_seeds} seeds; band: lowest to highest; dashed: peers")
+        } else {
+            "one run a line; dashed: peers".to_owned()
+        };
+        let psnr = || Axis { label: "test PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() };
+        let over_time = Chart {
+            title: "PSNR of held-out images over time".into(),
+            subtitle,
+            x: Axis {
+                label: "seconds of training (log)".into(),
+                scale: Scale::Log,
+                ticks: marks::up_to(1.1 * last_secs).collect(),
+            },
+            y: psnr(),
+            lines: all().map(Measured::line).collect(),
+            floors: Vec::new(),
+            rules: Vec::new(),
+        };
+        let over_size = Chart {
+            title: "PSNR of held-out images over the size of the model".into(),
+            subtitle: format!("after {seconds} s; median of the runs"),
+            x: Axis { label: "GPU memory of the model, MB (log)".into(), scale: Scale::Log, ticks: Vec::new() },
+            y: psnr(),
+            lines: all().map(Measured::size_line).collect(),
+            floors: Vec::new(),
+            rules: Vec::new(),
+        };
+        let head =
+            ["data, method", "runs", "PSNR, dB", "std, dB", "seconds", "primitives", "extent", "spread, %", "MB"];
+        let head = head.map(str::to_owned).into_iter().chain(WANTED_DB.map(|wanted_db| format!("to {wanted_db} dB")));
+        let table = Table {
+            title: format!("After {seconds} s (peers: after their last row)"),
+            head: head.collect(),
+            rows: all().map(|measured| measured.summary.row(&measured.label)).collect(),
+        };
+        let mut sentences = vec![
             format!(
-                "Each line is one data set, trained {n_seeds} times for {seconds} s with different seeds; loading and scoring \
-                 do not count. PSNR is the mean over images that were held out."
+                "Each line is one method on one data set, trained {n_seeds} times for {seconds} s with different seeds; loading \
+                 and scoring do not count. PSNR is the mean over images that were held out."
             ),
             "A quality is reached where the line between two marks, over the logarithm of time, crosses it; a curve that starts \
              above counts by its first mark. Peers' curves come from their files and may stem from another machine."
                 .into(),
-            format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),
-        ],
-        charts: vec![("", chart)],
-        tables: vec![table],
-        numbers: serde_json::json!({
-            "bench": "curve",
-            "adapter": runs.adapter(),
-            "seconds": args.seconds,
-            "n_seeds": n_seeds,
-            "lines": all().collect::<Vec<_>>(),
-        }),
-    };
-    let page = findings.write(runs.out())?;
-    Ok((findings, page))
+            "Primitives are splats, voxel blocks (tsdf) or table entries (nerf). A distance field is done when it has taken in \
+             every image once: its line ends there."
+                .into(),
+        ];
+        sentences.extend(self.notes.iter().cloned());
+        sentences.push(format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")));
+        let findings = Findings {
+            name: "curve",
+            title: "Accuracy over time".into(),
+            sentences,
+            charts: vec![("", over_time), ("-size", over_size)],
+            tables: vec![table],
+            numbers: serde_json::json!({
+                "bench": "curve",
+                "adapter": runs.adapter(),
+                "seconds": self.args.seconds,
+                "n_seeds": n_seeds,
+                "notes": self.notes,
+                "lines": all().collect::<Vec<_>>(),
+            }),
+        };
+        let page = findings.write(runs.out())?;
+        Ok((findings, page))
+    }
 }
 
 #[cfg(test)]
@@ -306,12 +385,14 @@ mod tests {
     #[test]
     fn the_summary_counts_who_reached_a_quality() {
         let curves = [vec![(1.0, 20.0), (4.0, 30.0)], vec![(1.0, 20.0), (4.0, 26.0)]];
-        let summary = Summary::of(&curves, &[30.0, 26.0], &[1000.0, 3000.0]);
+        let ends =
+            Ends { psnr: vec![30.0, 26.0], primitives: vec![1000.0, 3000.0], bytes: vec![5e6, 7e6], ..Ends::default() };
+        let summary = Summary::of(&curves, &ends);
         assert_eq!((summary.psnr, summary.primitives), (Some(28.0), Some(2000.0)));
         let [to_25, to_28, _] = &summary.seconds_to[..] else { panic!("three qualities") };
         assert_eq!((to_25.n_runs, to_28.n_runs), (2, 1));
         assert_eq!(to_25.seconds.map(|seconds| (seconds * 100.0).round()), Some(259.0));
         let row = summary.row("fox");
-        assert!(row[8].ends_with("(1 of 2)") && row[5] == "1000 to 3000", "{row:?}");
+        assert!(row[10].ends_with("(1 of 2)") && row[6] == "1000 to 3000" && row[8] == "6.00", "{row:?}");
     }
 }

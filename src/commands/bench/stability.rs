@@ -7,6 +7,7 @@ use crate::bench::statistics::{Between, break_point, extent, median};
 use crate::bench::variant::{CAMERAS_AS_GIVEN, Variant};
 use crate::chart::{Axis, Chart, Line, Point, Rule, Scale, short};
 use crate::exit::{self, BadArgument, Exit};
+use crate::method::Recipe;
 use crate::session::Limits;
 use crate::training;
 use anyhow::ensure;
@@ -120,7 +121,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let data = runs.load(&args.data, &mut HashSet::new())?;
     let plans = args.plans(&data)?;
     let n_levels: usize = plans.iter().map(|plan| plan.levels.len()).sum();
-    let variants = told_apart(&data.options);
+    let variants = told_apart(&data.only_recipe()?.options);
     runs.expect(n_levels * variants.len() * usize::try_from(args.seeds)?);
     let mut envelopes: Vec<Envelope> = Vec::new();
     let mut page = None;
@@ -186,11 +187,12 @@ fn measure(
         rate_hz: plan.rate_hz,
     });
     let mut finished = Vec::new();
-    for seed in data.options.seed..data.options.seed.saturating_add(args.seeds) {
+    let Recipe { kind, options: usual } = data.only_recipe()?;
+    for seed in usual.seed..usual.seed.saturating_add(args.seeds) {
         finished.push(runs.run(Job {
             name: format!("stability {} {} {size} seed {seed}", data.name, variant.name),
             data,
-            options: variant.options(&SplatOptions { seed, ..data.options.clone() }),
+            recipe: Recipe { kind: *kind, options: variant.options(&SplatOptions { seed, ..usual.clone() }) },
             limits,
             disturbed: disturbed.clone(),
             variant: Some(variant.name.to_owned()),
@@ -390,7 +392,7 @@ fn findings(
         "one run a size".to_owned()
     };
     let subtitle = format!("after {length}; {spread}");
-    let label = format!("{}, {}", data.name, data.kind.name());
+    let label = format!("{}, {}", data.name, data.only_recipe()?.kind.name());
     let part = |what: Disturbance| match what {
         Disturbance::PoseNoise => "-pose-noise",
         Disturbance::ClockOffset => "-clock-offset",
@@ -432,7 +434,7 @@ fn findings(
         numbers: serde_json::json!({
             "bench": "stability",
             "data": data.path,
-            "method": data.kind.name(),
+            "method": data.only_recipe()?.kind.name(),
             "adapter": runs.adapter(),
             "disturbances": envelopes,
         }),

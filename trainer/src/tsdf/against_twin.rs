@@ -3,6 +3,7 @@
 use super::block::{Blocks, N_VOXELS, Place, stored_distance};
 use super::chosen::Lattice;
 use super::reference::{self, Ray, VoxelBlocks};
+use super::tests::fuse_all;
 use super::{TsdfModel, TsdfOptions};
 use crate::gpu::{Gpu, GpuOptions};
 use crate::mismatches::Mismatches;
@@ -34,7 +35,7 @@ fn fused(options: &GpuOptions, keyframes: &[Arc<Keyframe>]) -> (Blocks, Lattice,
     for keyframe in keyframes {
         model.push(keyframe.clone()).unwrap();
     }
-    model.seed().unwrap();
+    fuse_all(&mut model);
     let lattice = model.lattice().unwrap().clone();
     (model.blocks().unwrap(), lattice, model)
 }
@@ -70,7 +71,7 @@ fn fused_with_twin(options: &GpuOptions, keyframes: &[Arc<Keyframe>]) -> (Blocks
     let mut twin = VoxelBlocks::new();
     for keyframe in keyframes {
         model.push(keyframe.clone()).unwrap();
-        model.seed().unwrap();
+        fuse_all(&mut model);
         let lattice = model.lattice().unwrap().clone();
         for place in model.blocks().unwrap().into_keys() {
             twin.entry(place).or_insert_with(reference::unseen);
@@ -231,7 +232,7 @@ fn poisoned_depth_gives_no_blocks_and_the_rest_is_as_without_it() {
         for keyframe in all_bad {
             model.push(keyframe).unwrap();
         }
-        model.seed().unwrap();
+        fuse_all(&mut model);
         assert!(model.blocks().unwrap().is_empty());
         assert_eq!(model.progress().step, 3);
     }

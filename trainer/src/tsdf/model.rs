@@ -384,11 +384,7 @@ impl Method for TsdfModel {
 
     fn seed(&mut self) -> Result<(), Error> {
         self.settle()?;
-        while !self.pending.is_empty() {
-            self.step(self.pending.len() as u64)?;
-            self.settle()?;
-        }
-        Ok(())
+        self.fuse_first()
     }
 
     fn prepare(&mut self) -> Result<(), Error> {

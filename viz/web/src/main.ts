@@ -3,12 +3,14 @@
 import { Connection } from "./connection";
 import { element } from "./element";
 import { LiveImages } from "./live_images";
+import { ModelSwitch } from "./model_switch";
 import { BACKGROUND, OrbitView } from "./orbit_view";
-import type { BinaryHeader, LiveImageHeader, PictureHeader, TextMessage } from "./protocol";
+import type { BinaryHeader, LiveImageHeader, PictureHeader, Status, TextMessage } from "./protocol";
 import { Readouts } from "./readouts";
 import { RenderAsker } from "./render_asker";
 
 let stages = [0.1, 0.5, 1];
+let latestStatus: Status | null = null;
 let latestStep = -1;
 let liveCamera: LiveImageHeader | null = null;
 
@@ -29,7 +31,11 @@ const connection = new Connection(`ws://${location.host}/ws`, {
   text: receiveText,
   binary: receiveBinary,
 });
-const asker = new RenderAsker(connection, () => view.view(), () => stages, BACKGROUND);
+const models = new ModelSwitch(() => {
+  asker.restart();
+  if (latestStatus) showStatus(latestStatus);
+});
+const asker = new RenderAsker(connection, () => view.view(), () => stages, BACKGROUND, () => models.method);
 
 function receiveText(message: TextMessage): void {
   switch (message.type) {
@@ -37,9 +43,9 @@ function receiveText(message: TextMessage): void {
       stages = message.default_stages;
       break;
     case "status":
-      readouts.show(message);
-      if (message.step !== latestStep) asker.learned();
-      latestStep = message.step;
+      latestStatus = message;
+      models.list(message);
+      showStatus(message);
       break;
     case "scene":
       view.setScene(message);
@@ -55,6 +61,13 @@ function receiveText(message: TextMessage): void {
     case "goodbye":
       break;
   }
+}
+
+function showStatus(status: Status): void {
+  const model = models.shown(status);
+  readouts.show(status, model);
+  if (model.step !== latestStep) asker.learned();
+  latestStep = model.step;
 }
 
 function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): void {

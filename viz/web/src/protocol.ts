@@ -18,19 +18,25 @@ export interface Hello {
   default_stages: number[];
 }
 
-export interface Status {
-  type: "status";
-  state: string;
+/** Where a model stands. */
+export interface ModelStatus {
   method: string;
-  seconds: number;
   step: number;
   step_millis: number | null;
   primitives: number;
   bytes: number;
-  keyframes: number;
-  refused: Record<string, number>;
   psnr: number | null;
   psnr_history: [number, number][];
+}
+
+/** Where the run stands, and its first model. */
+export interface Status extends ModelStatus {
+  type: "status";
+  state: string;
+  seconds: number;
+  keyframes: number;
+  refused: Record<string, number>;
+  others: ModelStatus[];
   notes: string[];
 }
 
@@ -107,6 +113,7 @@ export type BinaryHeader = PictureHeader | LiveImageHeader;
 export interface RenderMessage {
   type: "render";
   id: number;
+  method?: string | undefined;
   world_from_camera: number[];
   size_px: [number, number];
   projection: Pinhole;

@@ -2,23 +2,23 @@
 
 import { Chart, timeText } from "./chart";
 import { element } from "./element";
-import type { Status } from "./protocol";
+import type { ModelStatus, Status } from "./protocol";
 
 const PRIMITIVE_NAMES: Record<string, string> = { splat: "Splats", tsdf: "Voxel blocks", nerf: "Table entries" };
 
 export class Readouts {
   private readonly chart = new Chart(element("chart", HTMLCanvasElement));
 
-  show(status: Status): void {
+  show(status: Status, model: ModelStatus): void {
     text("state", status.state);
-    text("method", status.method);
-    text("psnr", status.psnr === null ? "–" : status.psnr.toFixed(2));
+    text("method", status.others.length === 0 ? model.method : ""); // Else the switch says it.
+    text("psnr", model.psnr === null ? "–" : model.psnr.toFixed(2));
     text("seconds", timeText(status.seconds));
-    text("step", count(status.step));
-    text("step-millis", status.step_millis === null ? "–" : `${status.step_millis.toPrecision(3)} ms`);
-    text("primitives-name", PRIMITIVE_NAMES[status.method] ?? "Primitives");
-    text("primitives", count(status.primitives));
-    text("bytes", bytesText(status.bytes));
+    text("step", count(model.step));
+    text("step-millis", model.step_millis === null ? "–" : `${model.step_millis.toPrecision(3)} ms`);
+    text("primitives-name", PRIMITIVE_NAMES[model.method] ?? "Primitives");
+    text("primitives", count(model.primitives));
+    text("bytes", bytesText(model.bytes));
     text("keyframes", count(status.keyframes));
     const reasons = Object.entries(status.refused).sort((a, b) => b[1] - a[1]);
     text("refused-total", count(reasons.reduce((sum, [, n]) => sum + n, 0)));
@@ -27,7 +27,7 @@ export class Readouts {
     );
     element("notes-card").hidden = status.notes.length === 0;
     element("notes").replaceChildren(...status.notes.map((note) => child("li", note)));
-    this.chart.set(status.psnr_history);
+    this.chart.set(model.psnr_history);
   }
 }
 

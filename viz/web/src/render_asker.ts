@@ -43,6 +43,7 @@ export class RenderAsker {
     private readonly view: () => View,
     private readonly stages: () => number[],
     private readonly background: [number, number, number],
+    private readonly method: () => string | undefined,
   ) {}
 
   /** The view has changed. */
@@ -110,6 +111,7 @@ export class RenderAsker {
     const message: RenderMessage = {
       type: "render",
       id: this.id,
+      method: this.method(), // Left out of the message where undefined.
       ...this.view(),
       stages,
       outputs: ["color", "depth"],

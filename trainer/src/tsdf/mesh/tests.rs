@@ -3,6 +3,7 @@
 use super::{Mesh, write_glb, write_ply};
 use crate::gpu::{Gpu, GpuOptions};
 use crate::test_scenes::{self as scenes, Shape};
+use crate::tsdf::tests::fuse_all;
 use crate::tsdf::{TsdfModel, TsdfOptions};
 use crate::{Keyframe, Method};
 use nalgebra::{Point3, Vector3};
@@ -14,7 +15,7 @@ fn model(options: TsdfOptions, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
     for keyframe in keyframes {
         model.push(keyframe.clone()).unwrap();
     }
-    model.seed().unwrap();
+    fuse_all(&mut model);
     model
 }
 

@@ -1,0 +1,168 @@
+//! Several methods that learn at once from the same images: each ends as it would alone, in a folder of its own.
+
+use image::{ImageBuffer, Luma, RgbImage};
+use serde_json::{Value, json};
+use std::path::Path;
+use std::process::{Command, Output};
+
+const N_PHOTOS: u32 = 10;
+const SIZE_PX: [u32; 2] = [48, 36];
+/// Steps of each method; the distance field is done after the eight images it may see.
+const N_STEPS: &str = "24";
+
+/// A nerfstudio folder with depth: a camera slides along a colorful wall, 1 m away from it.
+fn scene(folder: &Path) {
+    std::fs::create_dir(folder).expect("room on the disk");
+    let ([w, h], focal_px) = (SIZE_PX, 45.0);
+    let mut frames = Vec::new();
+    for ix in 0..N_PHOTOS {
+        let x_m = 0.05 * f64::from(ix);
+        let color = |u: u32, v: u32| {
+            let (x, y) = (x_m + (f64::from(u) - 23.5) / focal_px, (f64::from(v) - 17.5) / focal_px);
+            #[expect(clippy::cast_possible_truncation, reason = "27 to 227")]
+            let wave = |phase: f64| (127.0 + 100.0 * (8.0 * x + phase).sin() * (7.0 * y + phase).cos()) as u8;
+            image::Rgb([wave(0.0), wave(1.0), wave(2.0)])
+        };
+        let [photo, depth] = ["", "depth_"].map(|kind| format!("{kind}{ix:02}.png"));
+        RgbImage::from_fn(w, h, color).save(folder.join(&photo)).expect("room on the disk");
+        let metre = ImageBuffer::<Luma<u16>, _>::from_pixel(w, h, Luma([1000]));
+        metre.save(folder.join(&depth)).expect("room on the disk");
+        let rows = [[1.0, 0.0, 0.0, x_m], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 0.0, 1.0]];
+        frames.push(json!({ "file_path": photo, "depth_file_path": depth, "transform_matrix": rows }));
+    }
+    let lens = json!({ "fl_x": focal_px, "fl_y": focal_px, "cx": 24.0, "cy": 18.0, "w": w, "h": h, "frames": frames });
+    std::fs::write(folder.join("transforms.json"), lens.to_string()).expect("room on the disk");
+}
+
+fn fieldrig(folder: &Path, args: &[&str]) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
+    command.current_dir(folder).env_remove("FIELDRIG_LPIPS_WEIGHTS").args(args).output().expect("fieldrig starts")
+}
+
+/// The JSON lines of a training that succeeded.
+fn trained(folder: &Path, args: &[&str]) -> Vec<Value> {
+    let args = [&["train", "data", "--json"], args].concat();
+    let output = fieldrig(folder, &args);
+    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    let stdout = String::from_utf8(output.stdout).expect("stdout is UTF-8");
+    stdout.lines().map(|line| serde_json::from_str(line).expect("a JSON object a line")).collect()
+}
+
+fn ends(told: &[Value]) -> Vec<&Value> {
+    told.iter().filter(|event| event["event"] == "done").collect()
+}
+
+fn refused(folder: &Path, args: &[&str], words: &[&str]) {
+    let output = fieldrig(folder, args);
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{args:?}: {told}");
+    assert!(words.iter().all(|word| told.contains(word)), "{args:?}: {told}");
+    assert_eq!(told.lines().filter(|line| line.starts_with("error: ")).count(), 1, "{told}");
+}
+
+#[test]
+fn each_of_several_methods_ends_with_the_bits_that_it_has_alone() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    scene(&folder.join("data"));
+    let common = ["--steps", N_STEPS, "--seed", "3", "--refine", "image-poses"];
+    let all = ["--method", "tsdf,splat,nerf", "--max-splats", "500", "--out", "all"];
+    let together = trained(folder, &[&common[..], &all].concat());
+    let together = ends(&together);
+    let methods: Vec<&str> = together.iter().filter_map(|done| done["method"].as_str()).collect();
+    assert_eq!(methods, ["tsdf", "splat", "nerf"]);
+    for done in &together {
+        let method = done["method"].as_str().expect("a method");
+        let caps: &[&str] = if method == "splat" { &["--max-splats", "500"] } else { &[] };
+        let alone = trained(folder, &[&common[..], caps, &["--method", method, "--out", method]].concat());
+        let alone = ends(&alone)[0];
+        for key in ["checkpoint_sha256", "steps", "psnr", "primitives", "bytes"] {
+            assert_eq!(done[key], alone[key], "{method}: {key}");
+        }
+        assert_eq!(done["out"], json!(format!("all/{method}")));
+        // The logs differ in their first line alone: it holds the caps, which only splats have.
+        let [log, log_alone] = ["all/", ""].map(|run| {
+            let log = std::fs::read_to_string(folder.join(run).join(method).join("decisions.jsonl")).expect("a log");
+            log.lines().skip(1).map(str::to_owned).collect::<Vec<_>>()
+        });
+        assert!(!log.is_empty() && log == log_alone, "{method}: {log:?}");
+    }
+    assert_eq!(together[0]["steps"], json!(8), "the distance field has seen all");
+
+    goes_on_method_by_method(folder, together[1]);
+    exports_meshes(folder);
+    refused(folder, &["eval", "all", "data"], &["all/splat or all/tsdf or all/nerf"]);
+    refused(folder, &["train", "data", "--out", "all"], &["holds a model already", "splat/model.json"]);
+}
+
+/// The folder of each method is that of a run of its own.
+fn goes_on_method_by_method(folder: &Path, splat: &Value) {
+    let again = trained(folder, &["--replay-decisions", "all/splat/decisions.jsonl", "--out", "again"]);
+    assert_eq!(ends(&again)[0]["checkpoint_sha256"], splat["checkpoint_sha256"]);
+    let on = trained(folder, &["--resume", "all/splat", "--steps", N_STEPS, "--out", "on"]);
+    assert_eq!(ends(&on)[0]["checkpoint_sha256"], splat["checkpoint_sha256"]);
+    refused(folder, &["train", "data", "--resume", "all"], &["all/splat or all/tsdf or all/nerf"]);
+    let judged = fieldrig(folder, &["eval", "all/splat", "data", "--json"]);
+    let judged: Value = serde_json::from_slice(&judged.stdout).expect("a JSON object");
+    assert_eq!(judged["psnr"], splat["psnr"]);
+}
+
+/// Meshes come from distance fields alone, and can be made coarser.
+fn exports_meshes(folder: &Path) {
+    let export = |to: &str, more: &[&str], out: &str| {
+        let output = fieldrig(folder, &[&["export", "all/tsdf", "--to", to, "--out", out], more].concat());
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        std::fs::read(folder.join(out)).expect("a mesh")
+    };
+    for to in ["ply", "glb"] {
+        let saved = std::fs::read(folder.join(format!("all/tsdf/mesh.{to}"))).expect("the saved mesh");
+        assert!(export(to, &[], &format!("whole.{to}")) == saved, "{to}: the same mesh");
+        let coarse = export(to, &["--cell-m", "0.1"], &format!("coarse.{to}"));
+        assert!(coarse.len() < saved.len() / 4, "{to}: {} of {} bytes", coarse.len(), saved.len());
+    }
+    refused(folder, &["export", "all/tsdf", "--to", "spz", "--out", "a.spz"], &["which has no splats"]);
+    refused(folder, &["export", "all/tsdf", "--to", "glb", "--out", "whole.glb"], &["it is there already"]);
+    refused(folder, &["export", "all/tsdf", "--to", "glb", "--out", "a.ply"], &["ends in .glb"]);
+    refused(folder, &["export", "all/tsdf", "--to", "glb", "--out", "a.glb", "--cell-m", "0"], &["--cell-m"]);
+    refused(folder, &["export", "all/nerf", "--to", "glb", "--out", "a.glb"], &["neither splats nor a mesh"]);
+    refused(folder, &["export", "all", "--to", "glb", "--out", "a.glb"], &["all/splat or all/tsdf or all/nerf"]);
+}
+
+#[test]
+fn several_methods_share_the_time_and_tell_their_scores_by_one_clock() {
+    /// Turns are dealt by time; steps of splats grow longer, and the last turn of a slow machine is a large part.
+    const MOST_UNEVEN: f64 = 3.0;
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    scene(&folder.join("data"));
+    let args = ["--seconds", "2.1", "--max-splats", "500", "--method", "splat,nerf", "--out", "both"];
+    let told = trained(folder, &args);
+    let evals = |method: &str| -> Vec<&Value> {
+        told.iter().filter(|event| event["event"] == "eval" && event["method"] == method).collect()
+    };
+    let number = |event: &Value, key: &str| event[key].as_f64().unwrap_or_else(|| panic!("no {key} in {event}"));
+    let (splat, nerf) = (evals("splat"), evals("nerf"));
+    assert!(splat.len() >= 3 && splat.len() == nerf.len(), "{told:?}");
+    for (one, other) in splat.iter().zip(&nerf) {
+        assert!((number(one, "seconds") - number(other, "seconds")).abs() < 0.02, "at the same mark: {one}, {other}");
+    }
+    let millis = |evals: &[&Value]| {
+        let last = evals.last().expect("marks");
+        number(last, "step") * number(last, "step_millis")
+    };
+    let uneven = millis(&splat) / millis(&nerf);
+    assert!((1.0 / MOST_UNEVEN..MOST_UNEVEN).contains(&uneven), "splats had {uneven:.2} times as long: {told:?}");
+}
+
+#[test]
+fn methods_that_make_no_sense_are_refused_in_one_sentence() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    for (methods, word) in
+        [("splat,mesh", "\"mesh\""), ("tsdf,splat,tsdf", "tsdf stands there twice"), ("", "splat, nerf")]
+    {
+        refused(folder, &["train", "data", "--method", methods], &["--method", word]);
+        refused(folder, &["run", "rig.toml", "--method", methods], &["--method", word]);
+    }
+    refused(folder, &["train", "data", "--resume", "a", "--method", "splat,tsdf"], &["--method", "--resume"]);
+}
