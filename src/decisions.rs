@@ -368,6 +368,7 @@ mod tests {
             world_from_camera: Transform::identity(),
             twist: None,
             joint_twists: [].into(),
+            base: None,
             readout_secs: 0.0,
             split,
             truth: None,

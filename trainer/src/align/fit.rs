@@ -6,13 +6,14 @@ use super::layout::Layout;
 use super::pairs::Pair;
 use super::solve::Solved;
 use super::sums::{self, Looks, Noise, Part};
+use nalgebra::DVector;
 
 /// Steps at each level, the finest first.
-const ROUNDS: [usize; 4] = [12, 4, 4, 4];
+pub(super) const ROUNDS: [usize; 4] = [12, 4, 4, 4];
 /// By how much of its depth a point may be off before it counts as hidden, the finest first: errors are large at first.
 pub(super) const HIDDEN_FRAC: [f64; 4] = [0.04, 0.05, 0.07, 0.1];
 /// A step below this many standard deviations ends a level.
-const SMALL_STEP: [f64; 4] = [0.2, 2.0, 2.0, 2.0];
+pub(super) const SMALL_STEP: [f64; 4] = [0.2, 2.0, 2.0, 2.0];
 pub(super) const FIRST_NOISE: Noise = Noise { photo: 20.0, depth: 0.005 };
 
 /// What came of a fit.
@@ -40,7 +41,10 @@ pub(super) fn fit(frames: &[Frame], pairs: &[Pair], layout: Layout, from: &Corre
         for _ in 0..ROUNDS[level] {
             let sums = sums::of_pairs(frames, &corrections.views(frames, &layout), &some, &how);
             how.noise = sums::noise_of(&sums)?;
-            let solved = Solved::new(&layout, &corrections, &some, &sums);
+            let scales = layout.terms.iter().map(|term| term.scale());
+            let values = layout.terms.iter().map(|term| corrections.value(*term));
+            let [scales, values] = [scales.collect::<Vec<f64>>(), values.collect()].map(DVector::from);
+            let solved = Solved::new(scales, &values, &some, &sums);
             corrections.take(&layout, &solved.step);
             log::debug!("alignment: level {level}, {:?}, step of {:.2} sigma", how.noise, solved.step_in_sigmas());
             let is_small = solved.step_in_sigmas() < SMALL_STEP[level];
