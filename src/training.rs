@@ -8,7 +8,7 @@ use crate::session::{Evaluators, Limits, Session, Tell};
 use crate::stop::Stop;
 use crate::training_args::{Evidence, HowMany, Refine, Refining, TrainingArgs};
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 use trainer::Keyframe;
 use trainer::gpu::Gpu;
 use trainer::splat::SplatOptions;
@@ -25,15 +25,29 @@ pub(crate) struct Plan {
 /// Trains a fresh model until a limit, or until `stop` is asked.
 ///
 /// The clock starts when everything is compiled; seeding counts.
-pub(crate) fn train(gpu: Arc<Gpu>, plan: Plan, keyframes: &[Arc<Keyframe>], stop: &Stop) -> anyhow::Result<Session> {
+pub(crate) fn train(
+    gpu: Arc<Gpu>,
+    plan: Plan,
+    keyframes: &[Arc<Keyframe>],
+    learning: Duration,
+    stop: &Stop,
+) -> anyhow::Result<Session> {
     let mut method = plan.kind.start(gpu.clone(), plan.options)?;
     method.prepare()?;
-    drive(Session::new(gpu, method, plan.evaluators, plan.limits, plan.tell), keyframes, stop)
+    drive(Session::new(gpu, method, plan.evaluators, plan.limits, plan.tell), keyframes, learning, stop)
 }
 
 /// Starts the clock, pushes the keyframes, and trains until a limit, or until `stop` is asked.
-pub(crate) fn drive(mut session: Session, keyframes: &[Arc<Keyframe>], stop: &Stop) -> anyhow::Result<Session> {
-    session.start_clock(Instant::now());
+///
+/// `learning`: time spent on learning from the keyframes before; it counts.
+pub(crate) fn drive(
+    mut session: Session,
+    keyframes: &[Arc<Keyframe>],
+    learning: Duration,
+    stop: &Stop,
+) -> anyhow::Result<Session> {
+    let now = Instant::now();
+    session.start_clock(now.checked_sub(learning).unwrap_or(now));
     for keyframe in keyframes {
         session.push(keyframe)?;
     }

@@ -11,6 +11,7 @@ use crate::live::{Live, LiveOptions, Pace};
 use crate::method::{self, Kind};
 use crate::open::{self, Devices, Opened};
 use crate::session::{Evaluators, Limits, Session, Tell};
+use crate::stands::{StandReport, Stands};
 use crate::stop::Stop;
 use crate::training_args::{Evidence, HowMany, Refine, TrainingArgs};
 use crate::{print, run_folder};
@@ -89,6 +90,8 @@ struct Particulars {
     range_scans: usize,
     range_points: usize,
     losses: Vec<String>,
+    /// What was found of the base's pose at each stand after the first.
+    stands: Vec<StandReport>,
     /// Largest distance of a keyframe's camera from its true place, metres; in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
     worst_position_error_m: Option<f64>,
@@ -176,6 +179,7 @@ fn save(live: Live, args: &Args, rig: &Rig, out: &Path, damage: &OnceLock<String
         range_scans: leftover.join.range_scans().count(),
         range_points: leftover.join.range_scans().map(|scan| scan.points_in_world_m.len()).sum(),
         losses,
+        stands: leftover.stands.as_ref().map_or(Vec::new(), |stands| stands.reports().to_vec()),
         worst_position_error_m: live_error_m,
     };
     if n_train > 0 {
@@ -217,6 +221,7 @@ impl Args {
         Ok(Input {
             source,
             join: Join::new(rig)?,
+            stands: Stands::new(rig),
             recorder: self.record.as_deref().map(|file| open::recorder(file, rig)).transpose()?,
             lenses: rig
                 .cameras

@@ -12,13 +12,14 @@ use crate::print;
 use crate::replay::Replay;
 use crate::run_folder;
 use crate::session::{Evaluators, Limits, Session, Tell};
+use crate::stands::StandReport;
 use crate::stop::Stop;
 use crate::training;
 use crate::training_args::TrainingArgs;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 use trainer::align::Alignment;
 use trainer::{Keyframe, Split};
 
@@ -80,6 +81,8 @@ struct Particulars<'a> {
     n_selection: usize,
     n_test: usize,
     losses: &'a [String],
+    /// What was found of the base's pose at each stand after the first.
+    stands: &'a [StandReport],
     /// What was found about cameras by laying images over each other.
     alignment: Option<Alignment>,
 }
@@ -147,14 +150,17 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     for keyframe in data.keyframes.iter().filter(|keyframe| !is_new(keyframe)) {
         decisions.had(from_step.unwrap_or_default(), keyframe);
     }
+    let checkpoint_secs = checkpoint.map(|checkpoint| checkpoint.seconds);
     let session = Session::new(gpu, method, evaluators, limits, Tell::of_command(args.json))
         .with_checkpoints(Checkpoints::new(&out, args.checkpoints))
         .with_profile(args.profile)
         .with_decisions(decisions)
-        .going_on_after(checkpoint.map_or(0.0, |checkpoint| checkpoint.seconds));
+        .going_on_after(checkpoint_secs.unwrap_or(0.0));
+    // What was found of the base's stands counts once.
+    let learning = if checkpoint_secs.is_some() { Duration::ZERO } else { data.learning };
     let session = match &replay {
         Some(replay) => replay.drive(session, &rest, &stop)?,
-        None => training::drive(session, &rest, &stop)?,
+        None => training::drive(session, &rest, learning, &stop)?,
     };
 
     let alignment = session.alignment().cloned();
@@ -170,6 +176,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             n_selection: data.of_split(Split::Selection).len(),
             n_test: data.of_split(Split::Test).len(),
             losses: &data.losses,
+            stands: &data.stands,
             alignment: alignment.clone(),
         },
     )?;

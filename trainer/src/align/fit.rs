@@ -9,11 +9,11 @@ use super::sums::{self, Looks, Noise, Part};
 use nalgebra::DVector;
 
 /// Steps at each level, the finest first.
-pub(super) const ROUNDS: [usize; 4] = [12, 4, 4, 4];
+const ROUNDS: [usize; 4] = [12, 4, 4, 4];
 /// By how much of its depth a point may be off before it counts as hidden, the finest first: errors are large at first.
 pub(super) const HIDDEN_FRAC: [f64; 4] = [0.04, 0.05, 0.07, 0.1];
 /// A step below this many standard deviations ends a level.
-pub(super) const SMALL_STEP: [f64; 4] = [0.2, 2.0, 2.0, 2.0];
+const SMALL_STEP: [f64; 4] = [0.2, 2.0, 2.0, 2.0];
 pub(super) const FIRST_NOISE: Noise = Noise { photo: 20.0, depth: 0.005 };
 
 /// What came of a fit.

@@ -24,6 +24,7 @@ mod sums;
 pub(crate) mod tests;
 mod view;
 
+pub use beside::beside_training;
 pub(crate) use beside::{Aligning, taken_at};
 pub use report::{Alignment, Found, Moved, Number, Unseen};
 pub use stand::{Stand, stand};

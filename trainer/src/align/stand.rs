@@ -6,7 +6,7 @@
 //! way round.
 
 use super::corrections::Corrections;
-use super::fit::{FIRST_NOISE, HIDDEN_FRAC, ROUNDS, SMALL_STEP};
+use super::fit::{FIRST_NOISE, HIDDEN_FRAC};
 use super::frame::Frame;
 use super::judge;
 use super::layout::Layout;
@@ -27,6 +27,14 @@ use std::sync::Arc;
 /// How large an error of the base's pose may be before one would call it a mistake, metres and radians.
 const USUAL_SHIFT_M: f64 = 0.02;
 const USUAL_TURN_RAD: f64 = 0.0175;
+
+/// Most steps at each level: weights that change with the residuals make the way slower than Gauss and Newton's.
+const MOST_ROUNDS: usize = 20;
+/// A step below this many standard deviations ends a level, the finest first.
+const SMALL_STEP: [f64; 4] = [0.1, 0.3, 0.3, 0.3];
+/// Brightness errs in the same way in all pairs across two stands, near what hides other things and where light is reflected, and
+/// depth does not: by so many times its scatter it is taken to be less sure.
+const BRIGHTNESS_ERRS: f64 = 4.0;
 
 /// What the source of a base's poses got wrong on the way to a stand. Deviations are standard ones.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -212,16 +220,17 @@ impl Scene {
             let sums = sums::of_pairs(&self.frames, &self.views(found), &self.pairs, how);
             sums::noise_of(&sums).map(|noise| (sums, noise))
         };
-        how.noise = sums_of(&found, &how)?.1;
+        let mut noise = sums_of(&found, &how)?.1;
         let mut last = None;
         for level in (0..n_levels).rev() {
             (how.level, how.hidden_frac) = (level, HIDDEN_FRAC[level]);
-            for _ in 0..ROUNDS[level] {
-                let (sums, noise) = sums_of(&found, &how)?;
-                how.noise = noise;
+            for _ in 0..MOST_ROUNDS {
+                how.noise = Noise { photo: BRIGHTNESS_ERRS * noise.photo, ..noise };
+                let sums;
+                (sums, noise) = sums_of(&found, &how)?;
                 let solved = Solved::new(scales.clone(), &found, &self.pairs, &sums);
                 found = stepped(&found, &solved.step);
-                let (n_sigmas, noise) = (solved.step_in_sigmas(), how.noise);
+                let n_sigmas = solved.step_in_sigmas();
                 log::debug!("stand: level {level}, {noise:?}, step of {n_sigmas:.2} sigma");
                 last = Some(solved);
                 if n_sigmas < SMALL_STEP[level] {
@@ -229,7 +238,7 @@ impl Scene {
                 }
             }
         }
-        Some((found, last?, how.noise))
+        Some((found, last?, noise))
     }
 
     /// How much better the selection images of either side are predicted from the other.
