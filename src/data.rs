@@ -6,10 +6,12 @@ use crate::exit::{BadArgument, LackOfEvidence};
 use crate::holdout::Holdout;
 use crate::join::{Join, JoinEvent, KeyframeList, Use};
 use crate::open::{self, Opened};
+use crate::stands::{StandReport, Stands};
 use crate::{print, shrink};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 use trainer::{Keyframe, Split};
 
 /// Ending of a recording.
@@ -44,6 +46,10 @@ pub(crate) struct Data {
     pub(crate) has_times: bool,
     /// What was lost on the way; anything here makes the exit code 3.
     pub(crate) losses: Vec<String>,
+    /// What was found of the base's pose at each stand after the first.
+    pub(crate) stands: Vec<StandReport>,
+    /// Time that finding it took: it was learned from the images.
+    pub(crate) learning: Duration,
 }
 
 /// What data are for.
@@ -62,6 +68,8 @@ struct Selection {
     scale: Option<f64>,
     /// In place of the one in a recording.
     rig: Option<PathBuf>,
+    /// Poses are those that the base's source tells, wherever its stands show them to be wrong.
+    as_told: bool,
 }
 
 impl Data {
@@ -77,14 +85,15 @@ impl Data {
         let holdout = args.holdout.as_deref().map(Holdout::from_argument).transpose()?;
         Self::selected(
             path,
-            Selection { list, holdout, scale: args.scale, rig: args.rig.clone() },
+            Selection { list, holdout, scale: args.scale, rig: args.rig.clone(), as_told: false },
             purpose,
             overrides,
             quiet,
         )
     }
 
-    /// Reads the keyframes of a list, with their images shrunk to a share of their size.
+    /// Reads the keyframes of a list, with their images shrunk to a share of their size and their poses as the base's source
+    /// tells them.
     pub(crate) fn of_list(
         path: &Path,
         list: KeyframeList,
@@ -93,7 +102,7 @@ impl Data {
         overrides: &[Override],
         quiet: bool,
     ) -> anyhow::Result<Self> {
-        let selection = Selection { list: Some(list), holdout: None, scale: Some(scale), rig };
+        let selection = Selection { list: Some(list), holdout: None, scale: Some(scale), rig, as_told: true };
         Self::selected(path, selection, Purpose::Training, overrides, quiet)
     }
 
@@ -104,7 +113,7 @@ impl Data {
         overrides: &[Override],
         quiet: bool,
     ) -> anyhow::Result<Self> {
-        let Selection { list, holdout, scale, rig } = selection;
+        let Selection { list, holdout, scale, rig, as_told } = selection;
         let is_recording = path.extension().is_some_and(|ending| ending == RECORDING_ENDING);
         let mut data = if is_recording {
             let scale = scale.map(|scale| Override::new("train.scale", scale));
@@ -118,6 +127,9 @@ impl Data {
         };
         if let (true, Some(holdout)) = (is_recording, &holdout) {
             data.hold_out(holdout)?;
+        }
+        if !as_told {
+            data.realign();
         }
         let (wanted, what) = match purpose {
             Purpose::Training => (Split::Train, "no image is left to train on"),
@@ -167,6 +179,8 @@ impl Data {
             rig: None,
             has_times: folder.has_times(),
             losses: loaded.losses,
+            stands: Vec::new(),
+            learning: Duration::ZERO,
         };
         if let Some(list) = list {
             data.take_only(&list)?;
@@ -210,7 +224,22 @@ impl Data {
         losses.extend(damage.get().cloned());
         losses.extend(join.check_list()?);
         let names = keyframes.iter().map(|keyframe| name(keyframe)).collect();
-        Ok(Self { keyframes, names, rig: Some(rig), has_times: true, losses })
+        Ok(Self {
+            keyframes,
+            names,
+            rig: Some(rig),
+            has_times: true,
+            losses,
+            stands: Vec::new(),
+            learning: Duration::ZERO,
+        })
+    }
+
+    /// Corrects the keyframes of a base that walks, as a run does.
+    fn realign(&mut self) {
+        let Some(mut stands) = self.rig.as_ref().and_then(Stands::new) else { return };
+        self.keyframes = stands.corrected(std::mem::take(&mut self.keyframes));
+        (self.stands, self.learning) = (stands.reports().to_vec(), stands.spent());
     }
 
     /// Splits anew, each camera on its own.

@@ -150,6 +150,7 @@ fn keyframe(lens: &LensMaps, frame: &DatasetFrame, scale_frac: f64) -> anyhow::R
         twist: None,
         readout_secs: 0.0,
         joint_twists: [].into(),
+        base: None,
         split: Split::Train,
         truth: None,
     };

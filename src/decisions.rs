@@ -6,7 +6,8 @@ use crate::exit::BadArgument;
 use crate::fingerprint;
 use crate::join::{split_name, split_named};
 use anyhow::{Context, anyhow};
-use kinematics::Stamp;
+use kinematics::{Stamp, Transform};
+use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
 use std::fs::File;
 use std::io::Write;
@@ -66,7 +67,7 @@ impl Settings {
 }
 
 /// One decision, once so many updates had been made.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Entry {
     /// Updates made before, those included that a trial took back.
     pub(crate) step: u64,
@@ -75,7 +76,7 @@ pub(crate) struct Entry {
 }
 
 /// What was decided.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Decision {
     /// The checkpoint that this went on from had learned from it.
@@ -95,13 +96,17 @@ pub(crate) enum Decision {
 }
 
 /// A keyframe that came.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Pushed {
     pub(crate) camera: String,
     pub(crate) stamp_nanos: i64,
     split: String,
     fingerprint: String,
+    /// What its poses were multiplied by from the left, where the base's stand was estimated anew: a translation in metres, then
+    /// a quaternion with its real part last.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    world_from_told: Option<[f64; 7]>,
 }
 
 /// A keyframe that went.
@@ -137,6 +142,15 @@ impl Pushed {
             stamp_nanos: keyframe.stamp.0,
             split: split_name(keyframe.split).to_owned(),
             fingerprint: fingerprint_of(keyframe),
+            world_from_told: keyframe.base.as_ref().map(|base| base.world_from_told).filter(is_motion).map(numbers),
+        }
+    }
+
+    /// The keyframe as it came, from the one that the base's source places.
+    pub(crate) fn placed(&self, told: &Arc<Keyframe>) -> Arc<Keyframe> {
+        match self.world_from_told {
+            Some(numbers) => Arc::new(told.carried(&motion(numbers))),
+            None => told.clone(),
         }
     }
 
@@ -149,6 +163,21 @@ impl Pushed {
     pub(crate) fn is_like(&self, keyframe: &Keyframe) -> bool {
         self.fingerprint == fingerprint_of(keyframe)
     }
+}
+
+fn is_motion(transform: &Transform) -> bool {
+    *transform != Transform::identity()
+}
+
+fn numbers(motion: Transform) -> [f64; 7] {
+    let [x, y, z] = motion.translation.vector.into();
+    let [i, j, k, w] = motion.rotation.coords.into();
+    [x, y, z, i, j, k, w]
+}
+
+/// The inverse of [`numbers`], to the last bit.
+fn motion([x, y, z, i, j, k, w]: [f64; 7]) -> Transform {
+    Transform::from_parts(Translation3::new(x, y, z), UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k)))
 }
 
 fn fingerprint_of(keyframe: &Keyframe) -> String {
@@ -368,6 +397,7 @@ mod tests {
             world_from_camera: Transform::identity(),
             twist: None,
             joint_twists: [].into(),
+            base: None,
             readout_secs: 0.0,
             split,
             truth: None,

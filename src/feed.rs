@@ -1,6 +1,7 @@
-//! The input side of a run: source, recorder and join on a thread of their own, keyframes out of a bounded queue.
+//! The input side of a run: source, recorder, join and the stands of the base on a thread of their own, keyframes out of a bounded queue.
 
 use crate::join::{Join, JoinEvent, Seen};
+use crate::stands::Stands;
 use crate::stop::Stop;
 use anyhow::{Context, anyhow};
 use drivers::recording::Recorder;
@@ -44,6 +45,8 @@ struct Shared {
 pub(crate) struct Input {
     pub(crate) source: Box<dyn Source>,
     pub(crate) join: Join,
+    /// Where the base walks.
+    pub(crate) stands: Option<Stands>,
     pub(crate) recorder: Option<Recorder>,
     /// Focal length and principal point of every camera, pixels.
     pub(crate) lenses: HashMap<Arc<str>, ([f64; 2], [f64; 2])>,
@@ -52,6 +55,7 @@ pub(crate) struct Input {
 /// What is left when the input ended.
 pub(crate) struct Leftover {
     pub(crate) join: Join,
+    pub(crate) stands: Option<Stands>,
     /// Why the input broke off, if it did.
     pub(crate) input_error: Option<drivers::Error>,
     /// Why the recording broke off, if it did.
@@ -151,27 +155,28 @@ impl Pump {
             if matches!(sample, Sample::Image(_)) {
                 self.shared.first_image.get_or_init(Instant::now);
             }
+            let newest = sample.stamp();
             let events = self.input.join.push(sample);
-            if self.forward(events).is_err() {
+            if self.forward(events).and_then(|()| self.pass_time(newest)).is_err() {
                 break;
             }
         }
         let events = self.input.join.finish();
         // A trainer that hung up needs no more keyframes.
-        let _ = self.forward(events);
+        let _ = self.forward(events).and_then(|()| self.let_go());
         if let (Some(recorder), None) = (self.input.recorder.take(), &recording_error)
             && let Err(error) = recorder.finish()
         {
             recording_error = Some(error);
         }
-        Leftover { join: self.input.join, input_error, recording_error }
+        Leftover { join: self.input.join, stands: self.input.stands, input_error, recording_error }
     }
 
-    fn forward(&self, events: Vec<JoinEvent>) -> Result<(), Hangup> {
+    fn forward(&mut self, events: Vec<JoinEvent>) -> Result<(), Hangup> {
         for event in events {
             match event {
-                JoinEvent::Accepted(keyframe) => self.send(Change::Accepted(keyframe))?,
-                JoinEvent::Evicted { camera, stamp } => self.send(Change::Evicted { camera, stamp })?,
+                JoinEvent::Accepted(keyframe) => self.change(Change::Accepted(keyframe))?,
+                JoinEvent::Evicted { camera, stamp } => self.change(Change::Evicted { camera, stamp })?,
                 JoinEvent::Seen(seen) => self.show(&seen),
                 JoinEvent::Refused { why, .. } => {
                     *lock(&self.shared.refused).entry(why.name().to_owned()).or_default() += 1;
@@ -181,8 +186,27 @@ impl Pump {
         Ok(())
     }
 
-    fn send(&self, change: Change) -> Result<(), Hangup> {
-        self.sender.send(change).map_err(|_| Hangup)
+    fn change(&mut self, change: Change) -> Result<(), Hangup> {
+        let passed = match &mut self.input.stands {
+            Some(stands) => stands.push(change),
+            None => vec![change],
+        };
+        self.send(passed)
+    }
+
+    fn pass_time(&mut self, newest: Stamp) -> Result<(), Hangup> {
+        let passed = self.input.stands.as_mut().map(|stands| stands.pass_time(newest));
+        self.send(passed.unwrap_or_default())
+    }
+
+    /// Nothing more comes: what was held back goes on.
+    fn let_go(&mut self) -> Result<(), Hangup> {
+        let passed = self.input.stands.as_mut().map(Stands::finish);
+        self.send(passed.unwrap_or_default())
+    }
+
+    fn send(&self, changes: Vec<Change>) -> Result<(), Hangup> {
+        changes.into_iter().try_for_each(|change| self.sender.send(change).map_err(|_| Hangup))
     }
 
     /// Shows what a camera sees to whoever looks.
@@ -202,12 +226,13 @@ impl Pump {
             PixelFormat::DepthU16 { .. } => return,
         };
         let Some(&(focal_px, principal_px)) = self.input.lenses.get(&image.camera) else { return };
+        let pose = |stands: &Stands| stands.pose_now(&image.camera, &seen.world_from_camera);
         self.hub.set_live_image(LiveImage {
             camera: image.camera.clone(),
             stamp: image.stamp,
             size_px: image.size_px,
             pixels,
-            world_from_camera: Some(seen.world_from_camera),
+            world_from_camera: Some(self.input.stands.as_ref().map_or(seen.world_from_camera, pose)),
             focal_px,
             principal_px,
         });

@@ -85,6 +85,7 @@ mod tests {
             world_from_camera: Transform::translation(1.0, 2.0, 3.0),
             twist: Some(Twist::zero()),
             joint_twists: [].into(),
+            base: None,
             readout_secs: 0.01,
             split: Split::Train,
             truth: None,

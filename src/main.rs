@@ -30,6 +30,7 @@ mod scene_hint;
 mod session;
 mod shrink;
 mod splat_file;
+mod stands;
 mod stop;
 mod training;
 mod training_args;

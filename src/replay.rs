@@ -2,7 +2,7 @@
 
 use crate::config::Override;
 use crate::data::Data;
-use crate::decisions::{Decision, Decisions};
+use crate::decisions::{Decision, Decisions, Pushed};
 use crate::exit::{BadArgument, LackOfEvidence};
 use crate::join::KeyframeList;
 use crate::method::{Kind, Recipe};
@@ -45,6 +45,13 @@ impl Replay {
             .filter_map(|pushed| Some((pushed.camera.clone(), Stamp(pushed.stamp_nanos), pushed.split()?)))
             .collect();
         let mut data = Data::of_list(path, list, rig, self.decisions.settings.scale, &self.overrides(), quiet)?;
+        let as_pushed: HashMap<(&str, i64), &Pushed> =
+            pushed().map(|pushed| ((&*pushed.camera, pushed.stamp_nanos), pushed)).collect();
+        for keyframe in &mut data.keyframes {
+            if let Some(pushed) = as_pushed.get(&(&*keyframe.camera, keyframe.stamp.0)) {
+                *keyframe = pushed.placed(keyframe);
+            }
+        }
         let there = by_name(&data.keyframes);
         let (name, shown) = (self.name(), path.display());
         for pushed in pushed() {

@@ -9,7 +9,7 @@ use crate::stop::Stop;
 use crate::training_args::{Evidence, HowMany, Refine, Refining, TrainingArgs};
 use crate::turns;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 use trainer::Keyframe;
 use trainer::gpu::Gpu;
 use trainer::splat::SplatOptions;
@@ -25,20 +25,34 @@ pub(crate) struct Plan {
 /// Trains a fresh model until a limit, or until `stop` is asked.
 ///
 /// The clock starts when everything is compiled; seeding counts.
-pub(crate) fn train(gpu: Arc<Gpu>, plan: Plan, keyframes: &[Arc<Keyframe>], stop: &Stop) -> anyhow::Result<Session> {
+pub(crate) fn train(
+    gpu: Arc<Gpu>,
+    plan: Plan,
+    keyframes: &[Arc<Keyframe>],
+    learning: Duration,
+    stop: &Stop,
+) -> anyhow::Result<Session> {
     let kind = plan.recipe.kind;
     let mut method = plan.recipe.start(gpu.clone())?;
     method.prepare()?;
     let mut session = Session::new(gpu, (kind, method), plan.evaluators, plan.limits, plan.tell);
-    drive(std::slice::from_mut(&mut session), keyframes, stop)?;
+    drive(std::slice::from_mut(&mut session), keyframes, learning, stop)?;
     Ok(session)
 }
 
 /// Starts the clock, pushes the keyframes to all models, and trains each until a limit, or until `stop` is asked.
-pub(crate) fn drive(sessions: &mut [Session], keyframes: &[Arc<Keyframe>], stop: &Stop) -> anyhow::Result<()> {
+///
+/// `learning`: time spent on learning from the keyframes before; it counts.
+pub(crate) fn drive(
+    sessions: &mut [Session],
+    keyframes: &[Arc<Keyframe>],
+    learning: Duration,
+    stop: &Stop,
+) -> anyhow::Result<()> {
     let now = Instant::now();
+    let began = now.checked_sub(learning).unwrap_or(now);
     for session in &mut *sessions {
-        session.start_clock(now);
+        session.start_clock(began);
         for keyframe in keyframes {
             session.push(keyframe)?;
         }

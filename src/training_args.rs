@@ -23,9 +23,10 @@ pub(crate) struct TrainingArgs {
     /// Most splats, 1 to 100000000 [default: the rig file's, else 400000]
     #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(MAX_SPLATS))]
     pub(crate) max_splats: Option<u64>,
-    /// What is found about cameras: auto (what pays on held-back images), none, or a list of mount, delay, joints, depth-pose,
-    /// lens, depth-scale, readout, image-poses and image-gains, separated by commas. Where images have depth they are laid over
-    /// each other at the start; else it is learned with the scene [default: none; for data on disk auto on a GPU]
+    /// What is found about cameras: auto (what pays on held-back images), none, or a list of base, mount, delay, joints,
+    /// depth-pose, lens, depth-scale, readout, image-poses and image-gains, separated by commas. Where images have depth they are
+    /// laid over each other at the start, with base at each stand of a base that walks; else it is learned with the scene
+    /// [default: base; for data on disk auto on a GPU]
     #[arg(long, value_name = "TERMS", value_delimiter = ',', hide_possible_values = true)]
     pub(crate) refine: Vec<Refine>,
     /// How many splats there are in the end: tested (grown up to --max-splats, then halved as long as that costs less than
@@ -62,6 +63,8 @@ pub(crate) enum HowMany {
 pub(crate) enum Refine {
     Auto,
     None,
+    /// Not of the cameras: the rig file's `base.realign`.
+    Base,
     Mount,
     Delay,
     Joints,
@@ -115,7 +118,8 @@ impl TrainingArgs {
     pub(crate) fn check_learned(&self, kinds: &[Kind], evidence: Evidence) -> Result<(), BadArgument> {
         let can_align = |term: &Refine| evidence.depth && *term != Refine::ImageGains;
         let can_learn = |term: &Refine| kinds.contains(&Kind::Nerf) && *term == Refine::ImagePoses;
-        let is_left = |term: &Refine| matches!(term, Refine::Auto | Refine::None) || can_align(term) || can_learn(term);
+        let is_other = |term: &Refine| matches!(term, Refine::Auto | Refine::None | Refine::Base);
+        let is_left = |term: &Refine| is_other(term) || can_align(term) || can_learn(term);
         if kinds.contains(&Kind::Splat) || self.refine.iter().all(is_left) {
             return Ok(());
         }
@@ -188,6 +192,10 @@ impl TrainingArgs {
         }
         if let Some(n) = self.max_splats {
             overrides.push(Override::new("train.max_splats", n.cast_signed()));
+        }
+        if !self.refine.is_empty() {
+            let realign = self.refine.iter().any(|term| matches!(term, Refine::Auto | Refine::Base));
+            overrides.push(Override::new("base.realign", realign));
         }
         overrides
     }

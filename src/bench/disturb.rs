@@ -281,6 +281,7 @@ mod tests {
                 twist: None,
                 readout_secs: 0.0,
                 joint_twists: [].into(),
+                base: None,
                 split: Split::of(usize::try_from(ix).expect("not negative")),
                 truth: None,
             })

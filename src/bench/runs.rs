@@ -262,7 +262,7 @@ impl<'a> Runs<'a> {
             limits: job.limits,
             tell: if self.args.json { Tell::Nothing } else { Tell::Bar },
         };
-        let session = training::train(self.gpu.clone(), plan, &(job.keyframes)(), &self.stop)?;
+        let session = training::train(self.gpu.clone(), plan, &(job.keyframes)(), job.data.data.learning, &self.stop)?;
         if self.stop.asked() && !session.is_over() {
             bail!("stopped before its end: the same command with --out {} goes on from there", self.out.display());
         }

@@ -1,6 +1,6 @@
 //! `fieldrig eval`: how good a saved model is on the test images of some data.
 
-use crate::config::Rig;
+use crate::config::{Override, Rig};
 use crate::data::{Data, DataArgs, Purpose};
 use crate::evaluate::{Evaluator, ImageScores, Scores};
 use crate::exit::{self, Exit};
@@ -46,7 +46,8 @@ struct Named {
 /// Draws and scores every test image.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
-    let data = Data::load(&args.data, &args.images, Purpose::Scoring, &[], args.json)?;
+    let overrides = as_trained(&args.model);
+    let data = Data::load(&args.data, &args.images, Purpose::Scoring, &overrides, args.json)?;
     let tests = data.of_split(Split::Test);
     let n_trained_on = n_trained_on(args, &tests, data.rig.is_some());
     if n_trained_on > 0 {
@@ -72,6 +73,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         print::line(format_args!("{:30} {scores}", format!("mean of {}", per_image.len())))?;
     }
     Ok(exit::after(&data.losses))
+}
+
+/// Whether the base was realigned when the model was trained: else its scene is not where the images' poses have it.
+fn as_trained(model: &Path) -> Vec<Override> {
+    let trained_with = Rig::load(&model.join(drivers::recording::RIG_FILE), &[]);
+    trained_with.iter().map(|rig| Override::new("base.realign", rig.base.realign)).collect()
 }
 
 /// Whether the cameras of a rig are not those that the model was trained with, as the rig file in its folder has them.

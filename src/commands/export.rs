@@ -8,6 +8,7 @@ use crate::method::{self, Kind};
 use crate::open;
 use crate::print::{self, counted};
 use crate::splat_file;
+use crate::stands::Stands;
 use anyhow::{Context, ensure};
 use std::path::{Path, PathBuf};
 use trainer::tsdf::TsdfModel;
@@ -168,7 +169,11 @@ fn export_recording(args: &Args) -> anyhow::Result<Exit> {
     join.finish();
     bar.finish_and_clear();
     let unlisted = join.check_list()?;
-    let written = write_nerfstudio(&args.out, join.keyframes().cloned())
+    let mut keyframes: Vec<_> = join.keyframes().cloned().collect();
+    if let Some(mut stands) = Stands::new(&opened.rig) {
+        keyframes = stands.corrected(keyframes);
+    }
+    let written = write_nerfstudio(&args.out, keyframes.into_iter())
         .with_context(|| format!("cannot export {}", args.from.display()))?;
     log::info!("{}", join.counts());
     print::line(format!("{} -> {}", sentence(written), args.out.display()))?;

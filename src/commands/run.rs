@@ -14,6 +14,7 @@ use crate::open::{self, Devices, Opened};
 use crate::print;
 use crate::run_folder;
 use crate::session::{self, Ending, Evaluators, Limits, Session, Tell};
+use crate::stands::{StandReport, Stands};
 use crate::stop::Stop;
 use crate::training_args::{Evidence, HowMany, Refine, TrainingArgs};
 use drivers::Source;
@@ -91,6 +92,8 @@ struct Particulars {
     range_scans: usize,
     range_points: usize,
     losses: Vec<String>,
+    /// What was found of the base's pose at each stand after the first.
+    stands: Vec<StandReport>,
     /// Largest distance of a keyframe's camera from its true place, metres; in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
     worst_position_error_m: Option<f64>,
@@ -175,6 +178,7 @@ fn save(live: Live, args: &Args, rig: &Rig, folders: Vec<PathBuf>, damage: &Once
     let recording_error = leftover.recording_error.map(anyhow::Error::new);
     losses.extend(recording_error.map(|error| format!("the recording is cut off: {error:#}")));
     losses.extend(damage.get().cloned());
+    let stands = leftover.stands.as_ref().map_or(Vec::new(), |stands| stands.reports().to_vec());
     let ending = |(session, out): (Session, PathBuf)| Ending {
         particulars: Particulars {
             method: session.kind().name(),
@@ -186,6 +190,7 @@ fn save(live: Live, args: &Args, rig: &Rig, folders: Vec<PathBuf>, damage: &Once
             range_scans: leftover.join.range_scans().count(),
             range_points: leftover.join.range_scans().map(|scan| scan.points_in_world_m.len()).sum(),
             losses: losses.clone(),
+            stands: stands.clone(),
             worst_position_error_m: live_error_m,
         },
         session,
@@ -230,6 +235,7 @@ impl Args {
         Ok(Input {
             source,
             join: Join::new(rig)?,
+            stands: Stands::new(rig),
             recorder: self.record.as_deref().map(|file| open::recorder(file, rig)).transpose()?,
             lenses: rig
                 .cameras

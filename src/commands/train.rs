@@ -13,13 +13,14 @@ use crate::print;
 use crate::replay::Replay;
 use crate::run_folder;
 use crate::session::{self, Ending, Evaluators, Limits, Session, Tell};
+use crate::stands::StandReport;
 use crate::stop::Stop;
 use crate::training;
 use crate::training_args::TrainingArgs;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 use trainer::align::Alignment;
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
@@ -83,6 +84,8 @@ struct Particulars<'a> {
     n_selection: usize,
     n_test: usize,
     losses: &'a [String],
+    /// What was found of the base's pose at each stand after the first.
+    stands: &'a [StandReport],
     /// What was found about cameras by laying images over each other.
     alignment: Option<Alignment>,
 }
@@ -154,9 +157,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             _ => session.among_others(clock.clone()),
         });
     }
+    // What was found of the base's stands counts once.
+    let learning = if checkpoint.is_some() { Duration::ZERO } else { data.learning };
     match &replay {
         Some(replay) => replay.drive(&mut sessions[0], &rest, &stop)?,
-        None => training::drive(&mut sessions, &rest, &stop)?,
+        None => training::drive(&mut sessions, &rest, learning, &stop)?,
     }
 
     let alignment = sessions.iter().find_map(Session::alignment).cloned();
@@ -171,6 +176,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             n_selection: data.of_split(Split::Selection).len(),
             n_test: data.of_split(Split::Test).len(),
             losses: &data.losses,
+            stands: &data.stands,
             alignment: session.alignment().cloned(),
         },
         session,

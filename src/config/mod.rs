@@ -76,6 +76,8 @@ pub(crate) struct Base {
     pub(crate) world_from_base: Transform,
     /// Poses a second where the base moves.
     pub(crate) rate_hz: f64,
+    /// Whether its pose is estimated anew at each stand.
+    pub(crate) realign: bool,
     /// Error of a simulated base's poses at the end of its walk, root mean square, metres and radians.
     pub(crate) drift_m: f64,
     pub(crate) drift_rad: f64,

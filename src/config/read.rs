@@ -150,6 +150,7 @@ fn base(mut keys: Section<'_>) -> Base {
         address: keys.address("address").unwrap_or(USUAL_BASE_ADDRESS),
         world_from_base: pose(&mut keys, "world_from_base").unwrap_or_else(Transform::identity),
         rate_hz: keys.number("rate_hz", 1.0..=1000.0).unwrap_or(100.0),
+        realign: keys.flag("realign").unwrap_or(true),
         drift_m: drift_m.unwrap_or(0.02),
         drift_rad: drift_rad.unwrap_or(0.0175),
     };

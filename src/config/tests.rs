@@ -49,7 +49,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a good value that differs from the one in force, and a value that is not allowed.
-const KEYS: [(&str, &str, &str); 108] = [
+const KEYS: [(&str, &str, &str); 109] = [
     ("arm.driver", "'franka'", "'frankka'"),
     ("arm.address", "'172.16.0.2'", "7"),
     ("arm.urdf", "'other.urdf'", "7"),
@@ -63,6 +63,7 @@ const KEYS: [(&str, &str, &str); 108] = [
     ("base.world_from_base.xyz_m", "[1, 0, 0]", "[1, 0]"),
     ("base.world_from_base.quat_xyzw", "[1, 0, 0, 0]", "[1, 1, 0, 0]"),
     ("base.rate_hz", "50", "0"),
+    ("base.realign", "false", "1"),
     ("base.sim.drift_m", "0.1", "-0.1"),
     ("base.sim.drift_rad", "0.05", "2"),
     ("range.lidar.driver", "'sim'", "'laser'"),

@@ -61,6 +61,7 @@ fn base(base: &Base) -> Table {
         ("address", is(base.address.to_string())),
         ("world_from_base", pose(&base.world_from_base)),
         ("rate_hz", is(base.rate_hz)),
+        ("realign", is(base.realign)),
         ("sim", Some(Value::Table(sim))),
     ])
 }

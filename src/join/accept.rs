@@ -107,7 +107,8 @@ mod tests {
             let acceptance =
                 Acceptance::new(&rig.join, camera, false, Spacing { translation_m: 1.0, rotation_rad: 1.0 });
             let judge = |twist| {
-                let posed = Posed { world_from_camera: Transform::identity(), twist, joint_twists: [].into() };
+                let posed =
+                    Posed { world_from_camera: Transform::identity(), twist, joint_twists: [].into(), base: None };
                 acceptance.judge_speed(&posed, &camera.intrinsics, Some(0.01), 0.5)
             };
             assert_eq!(judge(None), expected);

@@ -11,6 +11,7 @@ mod pixels;
 mod ranges;
 mod refusal;
 mod spacing;
+mod standing;
 mod store;
 #[cfg(test)]
 mod tests;
@@ -138,8 +139,7 @@ impl Join {
                 let kept_all = self.ranges.push(scan);
                 self.counts.range_scans_refused += u64::from(!kept_all);
             }
-            // The truth about keyframes comes with their images.
-            Sample::BaseTruth(_) => {}
+            Sample::BaseTruth(truth) => self.motion.push_base_truth(&truth),
             Sample::Image(image) => self.push_image(image, &mut events),
             Sample::Truth(truth) => {
                 if let Some(camera) = self.cameras.iter_mut().find(|camera| camera.config.name == truth.image.camera) {
@@ -361,6 +361,7 @@ impl CameraState {
             twist: ripe.posed.twist,
             readout_secs: self.acceptance.readout_secs(),
             joint_twists: ripe.posed.joint_twists,
+            base: ripe.posed.base,
             split,
             truth,
         })

@@ -1,5 +1,6 @@
 //! Where the cameras are at a stamp, and what their velocity does to an image.
 
+use super::standing::Standing;
 use crate::config::{self, BaseDriver, Parent, Rig};
 use anyhow::Context;
 use drivers::BasePose;
@@ -7,6 +8,7 @@ use kinematics::{Chain, HistoryError, Intrinsics, JointHistory, JointState, Pose
 use nalgebra::Vector3;
 use std::sync::Arc;
 use std::time::Duration;
+use trainer::BasePlace;
 
 /// Readings kept: 20 s at 1 kHz, more than any image waits.
 const MAX_READINGS: usize = 20_000;
@@ -25,7 +27,15 @@ pub(super) struct Motion {
 /// Where the base is.
 enum BaseMotion {
     Fixed(Transform),
-    Told(PoseHistory),
+    Told(Box<Told>),
+}
+
+/// What a base that moves told.
+struct Told {
+    poses: PoseHistory,
+    standing: Standing,
+    /// Its true poses, from a simulator.
+    truth: PoseHistory,
 }
 
 /// A camera's pose and velocity at a stamp.
@@ -35,6 +45,8 @@ pub(super) struct Posed {
     pub(super) twist: Option<Twist>,
     /// Of the camera for each joint of the chain that moves by a radian or metre; none where no joint carries the camera.
     pub(super) joint_twists: Arc<[Twist]>,
+    /// Where the base was, where one that moves carries the camera.
+    pub(super) base: Option<BasePlace>,
 }
 
 impl Motion {
@@ -46,7 +58,8 @@ impl Motion {
         let base = match rig.base.driver {
             BaseDriver::Fixed => BaseMotion::Fixed(rig.base.world_from_base),
             BaseDriver::Tags | BaseDriver::Rgbd | BaseDriver::Udp | BaseDriver::Sim => {
-                BaseMotion::Told(PoseHistory::new(max_gap, MAX_READINGS))
+                let poses = || PoseHistory::new(max_gap, MAX_READINGS);
+                BaseMotion::Told(Box::new(Told { poses: poses(), standing: Standing::default(), truth: poses() }))
             }
         };
         let offsets = order.iter().map(|ix| rig.arm.joint_offsets.get(*ix).copied().unwrap_or(0.0)).collect();
@@ -75,7 +88,21 @@ impl Motion {
     pub(super) fn push_base(&mut self, pose: &BasePose) -> bool {
         match &mut self.base {
             BaseMotion::Fixed(_) => true,
-            BaseMotion::Told(history) => history.push(pose.stamp, pose.world_from_base).is_ok(),
+            BaseMotion::Told(told) => {
+                let is_sensible = told.poses.push(pose.stamp, pose.world_from_base).is_ok();
+                if is_sensible {
+                    told.standing.push(pose.stamp, &pose.world_from_base);
+                }
+                is_sensible
+            }
+        }
+    }
+
+    /// Takes what a simulator knows of the base.
+    pub(super) fn push_base_truth(&mut self, truth: &BasePose) {
+        if let BaseMotion::Told(told) = &mut self.base {
+            // Only told to people: what is refused here is missing there.
+            let _ = told.truth.push(truth.stamp, truth.world_from_base);
         }
     }
 
@@ -83,19 +110,32 @@ impl Motion {
     pub(super) fn world_from_base(&self, stamp: Stamp) -> Result<Transform, HistoryError> {
         match &self.base {
             BaseMotion::Fixed(pose) => Ok(*pose),
-            BaseMotion::Told(history) => history.at(stamp),
+            BaseMotion::Told(told) => told.poses.at(stamp),
         }
     }
 
     /// A camera at a stamp; `NotYet` when the readings do not reach so far.
     pub(super) fn at(&self, camera: &config::Camera, stamp: Stamp) -> Result<Posed, HistoryError> {
-        let (world_from_base, base_twist) = match &self.base {
-            BaseMotion::Fixed(pose) => (*pose, Twist::zero()),
-            BaseMotion::Told(history) if camera.parent != Parent::World => history.with_twist_at(stamp)?,
-            BaseMotion::Told(_) => (Transform::identity(), Twist::zero()),
+        let (world_from_base, base_twist, base) = match &self.base {
+            BaseMotion::Fixed(pose) => (*pose, Twist::zero(), None),
+            BaseMotion::Told(told) if camera.parent != Parent::World => {
+                let (world_from_base, twist) = told.poses.with_twist_at(stamp)?;
+                let place = BasePlace {
+                    stand: told.standing.at(stamp),
+                    world_from_base,
+                    world_from_told: Transform::identity(),
+                    truth: told.truth.at(stamp).ok(),
+                };
+                (world_from_base, twist, Some(place))
+            }
+            BaseMotion::Told(_) => (Transform::identity(), Twist::zero(), None),
         };
-        let carried =
-            |world_from_camera, twist| Posed { world_from_camera, twist: Some(twist), joint_twists: [].into() };
+        let carried = |world_from_camera, twist| Posed {
+            world_from_camera,
+            twist: Some(twist),
+            joint_twists: [].into(),
+            base: base.clone(),
+        };
         match camera.parent {
             Parent::World => Ok(carried(camera.parent_from_camera, Twist::zero())),
             Parent::Base => Ok(carried(
@@ -119,6 +159,7 @@ impl Motion {
                     world_from_camera: world_from_base * base_from_flange * camera.parent_from_camera,
                     twist: flange_twist.map(|twist| twist.of_attached(&camera.parent_from_camera)),
                     joint_twists: by_joint.iter().map(|twist| twist.of_attached(&camera.parent_from_camera)).collect(),
+                    base,
                 })
             }
         }

@@ -164,6 +164,7 @@ mod tests {
             twist: None,
             readout_secs: 0.0,
             joint_twists: [].into(),
+            base: None,
             split: Split::Train,
             truth: None,
         }

@@ -115,6 +115,7 @@ mod tests {
             twist: None,
             readout_secs: 0.0,
             joint_twists: [].into(),
+            base: None,
             split: Split::of(ix),
             truth: None,
         })

@@ -3,6 +3,7 @@
 use super::{Devices, Opened};
 use crate::config::{Override, Rig};
 use crate::join::{Join, JoinEvent};
+use crate::stands::Stands;
 use drivers::wire::datagram::{Clock, Head, PoseDatagram, ScanPart, encode_pose, encode_scan};
 use drivers::{RangePoint, Sample};
 use kinematics::Transform;
@@ -268,4 +269,49 @@ fn lockstep_and_the_network_are_refused_together() {
     );
     let refused = super::rig(rig, Devices::Real).err().expect("one waits, the other does not").to_string();
     assert!(refused.contains("sim.lockstep") && refused.contains("udp"), "{refused}");
+}
+
+#[test]
+fn a_base_that_drifts_on_its_way_is_found_again_live_and_from_its_recording() {
+    const LEFT_M: f64 = 1.5e-3; // Of images of 320x180: a pixel of the first stand is 7 mm of the cabinet.
+    const LEFT_RAD: f64 = 1.5e-3;
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    let list = |key, numbers: [f64; 2]| Override::new(key, Value::from(numbers.to_vec()));
+    let rig = small(
+        "mobile-arm.toml",
+        &[
+            list("camera.wrist.size_px", [320.0, 180.0]),
+            list("camera.wrist.intrinsics.focal_px", [226.3, 226.2]),
+            list("camera.wrist.intrinsics.principal_px", [162.0, 88.8]),
+            Override::new("train.scale", 1.0),
+            Override::new("sim.n_images", 96),
+        ],
+    );
+    let live = super::rig(rig, Devices::Sim).expect("the simulator");
+    let mut recorder = super::recorder(&path, &live.rig).expect("a new file");
+    let mut stands = Stands::new(&live.rig).expect("its base walks");
+    let (told, join) = keyframes(live, |sample| recorder.write(sample).expect("room on the disk"));
+    recorder.finish().expect("room on the disk");
+    let first = stands.corrected(told.clone());
+    let recorded = super::recording(&path, None, &[]).expect("a recording");
+    let mut again = Stands::new(&recorded.rig).expect("its base walks");
+    let replayed = again.corrected(keyframes(recorded, |_| {}).0);
+    assert!(bits(&first) == bits(&replayed), "the replay differs");
+    assert_eq!(stands.reports(), again.reports());
+
+    let off = |keyframe: &Keyframe| {
+        let truth = keyframe.truth.as_ref().expect("ground truth comes beside the images").world_from_camera;
+        let apart = truth.inverse() * keyframe.world_from_camera;
+        [apart.translation.vector.norm(), apart.rotation.angle()]
+    };
+    let at_second = |keyframe: &&Arc<Keyframe>| keyframe.base.as_ref().is_some_and(|base| base.stand == Some(1));
+    let worst = |keyframes: &[Arc<Keyframe>]| {
+        let off = keyframes.iter().filter(at_second).map(|keyframe| off(keyframe));
+        off.fold([0.0_f64; 2], |worst, off| [worst[0].max(off[0]), worst[1].max(off[1])])
+    };
+    assert!(told.iter().filter(at_second).count() >= 14, "{}", join.counts());
+    let [before, after] = [worst(&told), worst(&first)];
+    assert!(before[0] > 0.015 && before[1] > 0.005, "{before:?} m and rad to begin with");
+    assert!(after[0] < LEFT_M && after[1] < LEFT_RAD, "{after:?} m and rad left: {:?}", stands.reports());
 }

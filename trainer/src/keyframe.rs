@@ -52,6 +52,8 @@ pub struct Keyframe {
     pub readout_secs: f64,
     /// How the camera moves, in its own axes, when one of the joints that carry it moves by a radian or metre; empty where unknown.
     pub joint_twists: Arc<[Twist]>,
+    /// Where the base was that carries the camera; `None` where no base moves it.
+    pub base: Option<BasePlace>,
     /// What it may be used for.
     pub split: Split,
     /// What a simulator knows.
@@ -74,6 +76,22 @@ impl Keyframe {
         Ok(())
     }
 
+    /// The keyframe as the base carries it when that stands elsewhere: all poses are multiplied from the left.
+    pub fn carried(&self, world_from_told: &Transform) -> Self {
+        Self {
+            world_from_camera: world_from_told * self.world_from_camera,
+            depth: self
+                .depth
+                .clone()
+                .map(|depth| DepthMap { world_from_camera: world_from_told * depth.world_from_camera, ..depth }),
+            base: self
+                .base
+                .clone()
+                .map(|base| BasePlace { world_from_told: world_from_told * base.world_from_told, ..base }),
+            ..self.clone()
+        }
+    }
+
     /// Whether all numbers about the camera are finite; readings of depth may be what they like.
     pub fn is_finite(&self) -> bool {
         let lens = |focal_px: [f64; 2], principal_px: [f64; 2]| {
@@ -88,6 +106,19 @@ impl Keyframe {
                 transform::is_finite(&depth.world_from_camera) && lens(depth.focal_px, depth.principal_px)
             })
     }
+}
+
+/// Where a base that walks was when it carried a camera.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BasePlace {
+    /// Which of the places where the base stood, counted from 0; `None` while it walks.
+    pub stand: Option<usize>,
+    /// Pose of the base at the keyframe's stamp, as its source told it.
+    pub world_from_base: Transform,
+    /// What the poses of the keyframe have been multiplied by from the left since: what its source got wrong.
+    pub world_from_told: Transform,
+    /// The true pose of the base, from a simulator.
+    pub truth: Option<Transform>,
 }
 
 /// Depth along a camera's z axis with its own size, lens and pose.

@@ -29,7 +29,7 @@ pub mod tsdf;
 
 pub use aligned::{Aligned, Renewable, WithRest};
 pub use error::Error;
-pub use keyframe::{DepthMap, Keyframe, Split, Truth};
+pub use keyframe::{BasePlace, DepthMap, Keyframe, Split, Truth};
 pub use method::{Method, Part, Progress};
 pub use range_points::RangePoints;
 pub use request::{Aabb, Picture, Projection, RenderRequest, Shutter};

@@ -94,6 +94,7 @@ pub(crate) fn keyframe(ix: i64, shapes: &[Shape], world_from_camera: Transform) 
         twist: None,
         readout_secs: 0.0,
         joint_twists: [].into(),
+        base: None,
         split: Split::Train,
         truth: None,
     }

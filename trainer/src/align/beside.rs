@@ -53,7 +53,7 @@ impl Aligning {
     /// Begins, on a thread of its own.
     pub(crate) fn begin(&mut self, keyframes: Vec<Arc<Keyframe>>, choice: &CameraChoice) {
         let choice = choice.clone();
-        *self = Self::Running(std::thread::spawn(move || beside_training(&keyframes, &choice)));
+        *self = Self::Running(std::thread::spawn(move || beside_training(|| align(&keyframes, &choice))));
     }
 
     /// Waits for what was begun, and says whether keyframes are to be corrected.
@@ -93,11 +93,11 @@ impl Aligning {
     }
 }
 
-/// Aligns on threads of its own: training, which makes images smaller on all processors, is not to wait for it.
-fn beside_training(keyframes: &[Arc<Keyframe>], choice: &CameraChoice) -> Option<Alignment> {
+/// Works on threads of its own: training, which makes images smaller on all processors, is not to wait for it.
+pub fn beside_training<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     let n_processors = std::thread::available_parallelism().map_or(1, usize::from);
     match rayon::ThreadPoolBuilder::new().num_threads((3 * n_processors).div_ceil(4)).build() {
-        Ok(pool) => pool.install(|| align(keyframes, choice)),
-        Err(_) => align(keyframes, choice),
+        Ok(pool) => pool.install(work),
+        Err(_) => work(),
     }
 }

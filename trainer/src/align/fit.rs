@@ -6,6 +6,7 @@ use super::layout::Layout;
 use super::pairs::Pair;
 use super::solve::Solved;
 use super::sums::{self, Looks, Noise, Part};
+use nalgebra::DVector;
 
 /// Steps at each level, the finest first.
 const ROUNDS: [usize; 4] = [12, 4, 4, 4];
@@ -40,7 +41,10 @@ pub(super) fn fit(frames: &[Frame], pairs: &[Pair], layout: Layout, from: &Corre
         for _ in 0..ROUNDS[level] {
             let sums = sums::of_pairs(frames, &corrections.views(frames, &layout), &some, &how);
             how.noise = sums::noise_of(&sums)?;
-            let solved = Solved::new(&layout, &corrections, &some, &sums);
+            let scales = layout.terms.iter().map(|term| term.scale());
+            let values = layout.terms.iter().map(|term| corrections.value(*term));
+            let [scales, values] = [scales.collect::<Vec<f64>>(), values.collect()].map(DVector::from);
+            let solved = Solved::new(scales, &values, &some, &sums);
             corrections.take(&layout, &solved.step);
             log::debug!("alignment: level {level}, {:?}, step of {:.2} sigma", how.noise, solved.step_in_sigmas());
             let is_small = solved.step_in_sigmas() < SMALL_STEP[level];

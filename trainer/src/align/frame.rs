@@ -239,6 +239,11 @@ impl Grey {
         Self { size, pixels, texels: (0..width * height).map(texel).collect() }
     }
 
+    /// Pixels of the keyframe along each side of one of these.
+    pub(super) fn texel_px(&self) -> f64 {
+        self.pixels
+    }
+
     /// Brightness at a place of the keyframe, in its pixels.
     pub(super) fn at(&self, pixel: [f64; 2]) -> Option<Sampled> {
         let [x, y] = pixel.map(|place| place / self.pixels - 0.5);

@@ -36,17 +36,7 @@ type Errors = (usize, f64, f64);
 impl Compared<'_> {
     /// PSNR, dB, of each selection image where the corrections have it, without and with: at the same spots.
     pub(super) fn scores(&self) -> (Vec<f64>, Vec<f64>) {
-        let views = self.views();
-        let errors = |pair: &Pair| {
-            let sides = [0, 1].map(|ix: usize| sums::sides(self.frames, &views[ix], *pair));
-            (pair.to, self.errors(sides, Part::All))
-        };
-        let errors: Vec<(usize, Errors)> = self.pairs.par_iter().map(errors).collect();
-        let mut by_image: BTreeMap<usize, Errors> = BTreeMap::new();
-        for (to, errors) in errors.into_iter().filter(|(_, (n, ..))| *n > LEAST_SPOTS) {
-            add(by_image.entry(to).or_default(), errors);
-        }
-        by_image.into_values().map(psnr).unzip()
+        scores(self.frames, self.pairs, &self.views(), self.noise, |pair| pair.to)
     }
 
     /// The same where each selection image has a pose of its own, found on one half of its blocks and scored on the other, and
@@ -76,7 +66,7 @@ impl Compared<'_> {
             for pair in pairs {
                 let from = |ix: usize| Side { frame: &self.frames[pair.from], view: &views[ix][pair.from] };
                 let sides = [0, 1].map(|ix| [from(ix), Side { frame, view: &own[ix] }]);
-                add(&mut sum, self.errors(sides, Part::Blocks { odd: !odd }));
+                add(&mut sum, errors(sides, self.noise, Part::Blocks { odd: !odd }));
             }
             Some(sum)
         };
@@ -91,18 +81,40 @@ impl Compared<'_> {
     fn views(&self) -> [Vec<View>; 2] {
         [self.without, self.with].map(|corrections| corrections.views(self.frames, &Layout::default()))
     }
+}
 
-    /// Of a pair, without and with, at the spots that both show.
-    fn errors(&self, sides: [[Side<'_>; 2]; 2], part: Part) -> Errors {
-        let how = Looks { level: 0, hidden_frac: HIDDEN_FRAC, noise: self.noise, part };
-        let looks = sides.map(|sides| sums::looks(sides, &sides[0].frame.even_spots, &how));
-        let both = || looks[0].iter().zip(&looks[1]).filter_map(|(one, other)| one.as_ref().zip(other.as_ref()));
-        let sum = |looks: Vec<&Look>| {
-            let tone = sums::tone(looks.iter().copied(), self.noise.photo);
-            looks.iter().map(|look| look.photo(tone).clamp(-CLIP, CLIP).powi(2)).sum::<f64>()
-        };
-        (both().count(), sum(both().map(|(one, _)| one).collect()), sum(both().map(|(_, other)| other).collect()))
+/// PSNR, dB, of the images that judge, under two sets of cameras: at the same spots.
+///
+/// * `judge_of`: which image a pair tells of.
+pub(super) fn scores(
+    frames: &[Frame],
+    pairs: &[Pair],
+    views: &[Vec<View>; 2],
+    noise: Noise,
+    judge_of: impl Fn(&Pair) -> usize + Sync,
+) -> (Vec<f64>, Vec<f64>) {
+    let of = |pair: &Pair| {
+        let sides = [0, 1].map(|ix: usize| sums::sides(frames, &views[ix], *pair));
+        (judge_of(pair), errors(sides, noise, Part::All))
+    };
+    let errors: Vec<(usize, Errors)> = pairs.par_iter().map(of).collect();
+    let mut by_image: BTreeMap<usize, Errors> = BTreeMap::new();
+    for (judge, errors) in errors.into_iter().filter(|(_, (n, ..))| *n > LEAST_SPOTS) {
+        add(by_image.entry(judge).or_default(), errors);
     }
+    by_image.into_values().map(psnr).unzip()
+}
+
+/// Of a pair, without and with, at the spots that both show.
+fn errors(sides: [[Side<'_>; 2]; 2], noise: Noise, part: Part) -> Errors {
+    let how = Looks { level: 0, hidden_frac: HIDDEN_FRAC, noise, part };
+    let looks = sides.map(|sides| sums::looks(sides, &sides[0].frame.even_spots, &how));
+    let both = || looks[0].iter().zip(&looks[1]).filter_map(|(one, other)| one.as_ref().zip(other.as_ref()));
+    let sum = |looks: Vec<&Look>| {
+        let tone = sums::tone(looks.iter().copied(), noise.photo);
+        looks.iter().map(|look| look.photo(tone).clamp(-CLIP, CLIP).powi(2)).sum::<f64>()
+    };
+    (both().count(), sum(both().map(|(one, _)| one).collect()), sum(both().map(|(_, other)| other).collect()))
 }
 
 fn add(sum: &mut Errors, errors: Errors) {

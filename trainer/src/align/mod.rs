@@ -18,13 +18,16 @@ mod poses;
 mod report;
 mod residual;
 mod solve;
+mod stand;
 mod sums;
 #[cfg(test)]
 pub(crate) mod tests;
 mod view;
 
+pub use beside::beside_training;
 pub(crate) use beside::{Aligning, taken_at};
 pub use report::{Alignment, Found, Moved, Number, Unseen};
+pub use stand::{Stand, stand};
 
 use crate::splat::{CameraChoice, Candidate, TermSet, Trial};
 use crate::{Keyframe, Split};

@@ -8,6 +8,9 @@ use super::frame::{Frame, Grey, Spot, depth_at, point};
 use super::view::View;
 use nalgebra::Vector3;
 
+/// One image is as fine as another up to this factor.
+const HALF_AN_OCTAVE: f64 = std::f64::consts::SQRT_2;
+
 /// A frame with its cameras.
 #[derive(Clone, Copy)]
 pub(super) struct Side<'a> {
@@ -68,9 +71,10 @@ impl Look {
             return None;
         }
         let tilt = [0, 1].map(|axis| reading_slope[axis] * j.view.depth_focal_px[axis] / reading_m);
+        let [level_i, level_j] = levels([i, j], [in_i.z, in_j.z], level);
         Some(Self {
-            i: Seen::new(i.view, in_i, i.frame.level(level))?,
-            j: Seen::new(j.view, in_j, j.frame.level(level))?,
+            i: Seen::new(i.view, in_i, i.frame.level(level_i))?,
+            j: Seen::new(j.view, in_j, j.frame.level(level_j))?,
             from_depth,
             in_depth,
             depth_pixel,
@@ -150,6 +154,15 @@ impl Look {
             }
         }
     }
+}
+
+/// Levels at which both images show a surface about equally fine, neither finer than asked for: a near view has detail that a
+/// far one cannot have.
+fn levels([i, j]: [Side<'_>; 2], [z_i, z_j]: [f64; 2], level: usize) -> [usize; 2] {
+    let texel_m = |side: Side<'_>, z_m: f64| z_m * side.frame.level(level).texel_px() / side.view.focal_px[0];
+    let (of_i, of_j) = (texel_m(i, z_i), texel_m(j, z_j));
+    let octaves = |share: f64| (0..3).take_while(|octave| share > HALF_AN_OCTAVE * f64::from(1 << octave)).count();
+    [level + octaves(of_j / of_i), level + octaves(of_i / of_j)]
 }
 
 impl Seen {

@@ -1,7 +1,5 @@
 //! One step of the shared terms, how sure it is, and which directions cannot be seen.
 
-use super::corrections::Corrections;
-use super::layout::Layout;
 use super::pairs::Pair;
 use super::sums::PairSums;
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
@@ -28,9 +26,11 @@ pub(super) struct Solved {
 
 impl Solved {
     /// Gauss and Newton's step with a pull to zero; directions that are not seen go to zero.
-    pub(super) fn new(layout: &Layout, corrections: &Corrections, pairs: &[Pair], sums: &[PairSums]) -> Self {
-        let n = layout.n();
-        let scales = DVector::from_iterator(n, layout.terms.iter().map(|term| term.scale()));
+    ///
+    /// * `scales`: how large each term may be.
+    /// * `values`: what the terms are now.
+    pub(super) fn new(scales: DVector<f64>, values: &DVector<f64>, pairs: &[Pair], sums: &[PairSums]) -> Self {
+        let n = scales.len();
         let (mut information, mut gradient) = (DMatrix::zeros(n, n), DVector::zeros(n));
         for pair in sums {
             for (row, term) in pair.terms.iter().enumerate() {
@@ -40,8 +40,7 @@ impl Solved {
                 }
             }
         }
-        let values = layout.terms.iter().map(|term| corrections.value(*term) / term.scale());
-        let values = DVector::from_iterator(n, values);
+        let values = values.component_div(&scales);
         let eigen = SymmetricEigen::new(information);
         let is_seen: Vec<bool> =
             eigen.eigenvalues.iter().map(|value| *value > INFLATION / (SEEN_FRAC * SEEN_FRAC)).collect();

@@ -192,6 +192,7 @@ pub(crate) fn capture(wrong: &Wrong) -> Vec<Arc<Keyframe>> {
             twist: Some(attached(twist_along(claimed_joints, rates))),
             readout_secs: if wrong.rolls { READOUT_SECS - wrong.readout_secs } else { 0.0 },
             joint_twists: (0..4).map(|joint| attached(twist_along(claimed_joints, unit(joint)))).collect(),
+            base: None,
             split: Split::of(ix),
             truth: None,
         })

@@ -28,7 +28,7 @@ impl Motion {
 }
 
 /// A frame under the corrections at hand.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct View {
     pub(super) world_from_camera: Motion,
     pub(super) color_from_depth: Motion,
@@ -101,6 +101,20 @@ impl View {
             readout: terms.readout,
             shares_lens: frame.shares_lens,
         })
+    }
+
+    /// The camera elsewhere, carried along by the motions of a frame: terms 0 to 5 are its metres, then radians, in its own axes.
+    pub(super) fn carried(&self, world_from_camera: &Transform, world_from_frame: &Transform) -> Self {
+        let frame_from_camera = world_from_frame.inverse() * world_from_camera;
+        let unit = |axis: usize| Vector3::from_fn(|row, _| if row == axis { 1.0 } else { 0.0 });
+        let column = |term: usize| {
+            let (linear_m_s, angular_rad_s) =
+                if term < 3 { (unit(term), Vector3::zeros()) } else { (Vector3::zeros(), unit(term - 3)) };
+            let twist = Twist { linear_m_s, angular_rad_s }.of_attached(&frame_from_camera);
+            (term, twist.linear_m_s, twist.angular_rad_s)
+        };
+        let world_from_camera = Motion::of(world_from_camera);
+        Self { world_from_camera, columns: (0..6).map(column).collect(), ..self.clone() }
     }
 
     /// Indices of all terms that move it, ascending.

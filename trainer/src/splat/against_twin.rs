@@ -350,6 +350,7 @@ fn moving_keyframe() -> Keyframe {
         }),
         readout_secs: 0.0,
         joint_twists: [].into(),
+        base: None,
         split: Split::Train,
         truth: None,
     }

@@ -86,6 +86,7 @@ pub(super) fn n_keyframes(gpu: &Arc<Gpu>, n: usize, with_depth: bool) -> Vec<Arc
                 twist: None,
                 readout_secs: 0.0,
                 joint_twists: [].into(),
+                base: None,
                 split: Split::of(ix),
                 truth: None,
             })

@@ -401,6 +401,7 @@ mod tests {
             twist: None,
             readout_secs: 0.0,
             joint_twists: [].into(),
+            base: None,
             split: crate::Split::Train,
             truth: None,
         }
