@@ -278,9 +278,9 @@ fn slopes_towards_poses_match_the_twin() {
         }
         let terms: Vec<[params::Term; params::TERM_STRIDE]> = gpu.read(&poses.terms, N_IMAGES + 1).unwrap();
         for (image, of_image) in expected.chunks(RAYS_PER_IMAGE).enumerate() {
-            for term in 0..params::TERMS {
+            for (term, got) in terms[image].iter().enumerate().take(params::TERMS) {
                 let sum: f64 = of_image.iter().map(|pose| parts(pose).as_flattened()[term]).sum();
-                let [value, first, second, n_steps] = terms[image][term].map(f64::from);
+                let [value, first, second, n_steps] = got.map(f64::from);
                 let what = |name: &str| format!("image {image}, term {term}, {name}");
                 wrong.check(what("slope"), first / 0.1, sum, 5e-5 * largest, 2e-4);
                 wrong.check(what("square"), second / 0.01, (first / 0.1).powi(2), 1e-12, 1e-4);

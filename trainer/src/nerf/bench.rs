@@ -45,7 +45,7 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
     let effort = Effort { n_rays, n_samples, ..Effort::FULL };
     let (n_levels, coarsest, finest, log2_entries) = GRID;
     let shape = GridShape::between(coarsest, finest, n_levels, log2_entries);
-    let sizes = Sizes { n_cells: shape.n_cells, log2_entries, n_codes: 1, has_depth: false, effort };
+    let sizes = Sizes { n_cells: shape.n_cells, log2_entries, n_codes: 1, has_depth: false, refines: false, effort };
     let compiled = Arc::new(Compiled::new(gpu, &sizes.effort)?);
     let mut learner = Learner::new(gpu, &options, sizes, compiled)?;
     let rays = synthetic_rays(effort);

@@ -89,20 +89,16 @@ impl Compiled {
 impl Learner {
     /// A field that knows nothing.
     pub(crate) fn new(gpu: &Gpu, options: &NerfOptions, sizes: Sizes, compiled: Arc<Compiled>) -> Result<Self, Error> {
-        let Effort { n_rays, n_samples, n_cells, n_steps, .. } = sizes.effort;
+        let Effort { n_rays, n_samples, .. } = sizes.effort;
         let shape = sizes.shape();
         let widths = compiled.widths.clone();
         let field = FieldBuffers::new(gpu, &shape, &widths, sizes.n_codes)?;
         let slopes = FieldSlopes::new(gpu, &shape)?;
         gpu.write(&slopes.scales, 0, bytemuck::cast_slice(&vec![FIRST_SCALE; shape.n_cells.len()]));
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of a u32")]
-        let n_points = (f64::from(n_cells.pow(3)) * VISITED_FRAC) as u32;
-        let visit =
-            Visit { n_cells, n_points: n_points.min(n_samples), kept_frac: KEPT_FRAC, step: 2.0 / n_steps as f32 };
         let learner = Self {
             compiled,
             moments: FieldMoments::new(gpu, &shape, &widths, &rule(options, 0.0))?,
-            occupancy: Occupancy::new(gpu, &visit, sizes.has_depth)?,
+            occupancy: Occupancy::new(gpu, &visit_of(&sizes.effort), sizes.has_depth)?,
             poses: None,
             samples: SampleBuffers::new(gpu, n_samples)?,
             step: StepBuffers::new(gpu, &widths, n_rays, n_samples)?,
@@ -296,6 +292,31 @@ impl Learner {
         self.passes.submit_timed(gpu)
     }
 
+    /// Halves cells and steps; each half knows what the whole did. What was sent must be done.
+    pub(crate) fn refine_cells(&mut self, gpu: &Gpu) -> Result<(), Error> {
+        let n = self.sizes.effort.n_cells as usize;
+        let known: Vec<f32> = gpu.read(&self.occupancy.thickness, n.pow(3))?;
+        self.sizes.effort = self.sizes.effort.finer();
+        self.sizes.refines = false;
+        self.passes.forget_bindings();
+        self.occupancy = Occupancy::new(gpu, &visit_of(&self.sizes.effort), self.sizes.has_depth)?;
+        // A step that is half as long holds back half as much; what is below zero says that nobody was there.
+        let of_half = |thickness: f32| if thickness > 0.0 { 0.5 * thickness } else { thickness };
+        let row = |row: usize| {
+            let (y, z) = (row % (2 * n), row / (2 * n));
+            (0..2 * n).map(move |x| x / 2 + n * (y / 2 + n * (z / 2)))
+        };
+        let finer: Vec<f32> =
+            (0..4 * n * n).into_par_iter().flat_map_iter(row).map(|cell| of_half(known[cell])).collect();
+        gpu.write(&self.occupancy.thickness, 0, bytemuck::cast_slice(&finer));
+        self.make_slot(gpu, 0)?;
+        let Self { compiled, field, samples, occupancy, moments, slots, passes: list, .. } = self;
+        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0] };
+        passes.mark(list, occupancy, moments);
+        list.submit(gpu);
+        Ok(())
+    }
+
     /// How its rays are walked.
     pub(crate) fn march(&self) -> reference::March {
         let Effort { n_cells, n_steps, .. } = self.sizes.effort;
@@ -378,6 +399,14 @@ impl Learner {
         }
         Ok(())
     }
+}
+
+/// How the occupancy is visited.
+fn visit_of(effort: &Effort) -> Visit {
+    let Effort { n_samples, n_cells, n_steps, .. } = *effort;
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of a u32")]
+    let n_points = (f64::from(n_cells.pow(3)) * VISITED_FRAC) as u32;
+    Visit { n_cells, n_points: n_points.min(n_samples), kept_frac: KEPT_FRAC, step: 2.0 / n_steps as f32 }
 }
 
 /// Whole sixteens of bytes, as buffers are; the last hint is given more than once.

@@ -26,6 +26,8 @@ use std::time::Instant;
 const MOST_SUBMIT_MILLIS: f64 = 20.0;
 /// Nearest place that rays look at, in units of the scene's radius.
 const BEGIN: f32 = 0.03;
+/// Cells of the occupancy become finer after one of so many of the planned steps: before a trial, which compares fields of one size.
+const FINER_AT_SHARE: u64 = 10;
 
 /// A neural field that learns from keyframes: a hash grid and two small networks, drawn along rays.
 #[derive(Debug)]
@@ -172,6 +174,27 @@ impl NerfModel {
         Ok(())
     }
 
+    /// Steps until cells become finer.
+    fn steps_to_finer_cells(&self) -> u64 {
+        let is_due = self.field.as_ref().is_some_and(|(_, learner)| learner.sizes.refines);
+        if is_due { self.finer_at().saturating_sub(self.step).max(1) } else { u64::MAX }
+    }
+
+    fn finer_at(&self) -> u64 {
+        (self.options.n_planned_steps / FINER_AT_SHARE).max(1)
+    }
+
+    /// Coarse cells are soon visited, fine ones tell better what is empty.
+    fn refine_when_due(&mut self) -> Result<(), Error> {
+        let is_due = self.step >= self.finer_at();
+        if !is_due || !self.field.as_ref().is_some_and(|(_, learner)| learner.sizes.refines) {
+            return Ok(());
+        }
+        self.settle()?;
+        let Some((_, learner)) = &mut self.field else { return Ok(()) };
+        learner.refine_cells(&self.gpu)
+    }
+
     /// Waits for the submit in flight.
     fn settle(&mut self) -> Result<(), Error> {
         let Some(in_flight) = self.in_flight.take() else { return Ok(()) };
@@ -265,8 +288,10 @@ impl Method for NerfModel {
             self.settle()?;
             return Ok(0);
         }
+        self.refine_when_due()?;
         self.try_when_due()?;
-        let n_steps = n.min(self.steps_per_submit()).min(self.steps_to_trial());
+        let most = self.steps_to_finer_cells().min(self.steps_to_trial());
+        let n_steps = n.min(self.steps_per_submit()).min(most);
         let since = Instant::now();
         for slot_ix in 0..n_steps {
             self.record(usize::try_from(slot_ix).expect("few steps"))?;

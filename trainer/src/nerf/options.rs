@@ -77,10 +77,10 @@ impl Effort {
 }
 
 impl Effort {
-    /// With cells and steps half as wide, where these are those of a GPU: a processor would wait for them.
+    /// With cells and steps half as wide, where these are those of a GPU: a processor would wait for them, and more would take too much memory.
     #[must_use]
     pub(crate) fn finer(self) -> Self {
-        if self.n_cells < Self::FULL.n_cells {
+        if self.n_cells != Self::FULL.n_cells {
             return self;
         }
         Self { n_cells: 2 * self.n_cells, n_steps: 2 * self.n_steps, ..self }

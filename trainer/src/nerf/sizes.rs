@@ -32,10 +32,13 @@ pub(crate) struct Sizes {
     pub(crate) n_codes: u32,
     /// Whether depth tells where something is.
     pub(crate) has_depth: bool,
+    /// Whether cells of the occupancy become finer once something is known.
+    #[serde(default)]
+    pub(crate) refines: bool,
     pub(crate) effort: Effort,
 }
 
-/// Whether most images have depth for most of what they show: then it is known from the start which cells are empty, and finer ones cost little.
+/// Whether most images have depth for most of what they show: then few cells hold anything, and finer ones cost little.
 fn is_dense<'a>(keyframes: impl Iterator<Item = &'a Keyframe>) -> bool {
     /// Every so manieth reading is looked at.
     const STRIDE: usize = 61;
@@ -65,7 +68,7 @@ impl Sizes {
         let n_levels =
             n_levels.next_multiple_of(2).clamp(LEAST_LEVELS, effort.most_levels.clamp(LEAST_LEVELS, MOST_LEVELS));
         let has_depth = keyframes.clone().any(|keyframe| keyframe.depth.is_some());
-        let effort = if is_dense(keyframes.clone()) { effort.finer() } else { effort };
+        let refines = effort.finer() != effort && is_dense(keyframes.clone());
         let n_pixels = keyframes.map(|keyframe| keyframe.rgba_srgb.len() / 4).max().unwrap_or(0);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a logarithm")]
         let wanted = (n_pixels.max(1) as f64 / PIXELS_PER_ENTRY).log2().ceil() as u32;
@@ -78,7 +81,7 @@ impl Sizes {
             let fits =
                 n_entries * BYTES_PER_ENTRY <= max_bytes && n_entries * MOMENT_BYTES_PER_ENTRY <= max_binding_bytes;
             if fits {
-                return Ok(Self { n_cells: shape.n_cells, log2_entries, n_codes: 1, has_depth, effort });
+                return Ok(Self { n_cells: shape.n_cells, log2_entries, n_codes: 1, has_depth, refines, effort });
             }
             if log2_entries == LEAST_LOG2_ENTRIES {
                 return Err(Error::BudgetTooSmall { max_bytes, least_bytes: n_entries * BYTES_PER_ENTRY });

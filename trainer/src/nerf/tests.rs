@@ -194,6 +194,31 @@ fn a_crop_a_range_and_all_directions_are_drawn() {
     assert_eq!((picture.size_px, picture.depth_m.len()), ([64, 32], 64 * 32));
 }
 
+/// Where depth is dense, cells become finer once something is known; stopping before or after changes nothing.
+#[test]
+fn cells_become_finer() {
+    const PLANNED: u64 = 40;
+    const END: u64 = 8;
+    let effort = Effort { n_cells: Effort::FULL.n_cells, ..options().effort.unwrap() };
+    let options = NerfOptions { effort: Some(effort), n_planned_steps: PLANNED, ..options() };
+    let keyframes = ball_on_floor(5);
+    let mut whole = started(options.clone(), &keyframes);
+    let mut parts = Vec::new();
+    for step in [3, 6] {
+        learn(&mut whole, step);
+        parts.push(state(&mut whole));
+    }
+    learn(&mut whole, END);
+    let n_bytes = |checkpoint: &crate::checkpoint::Checkpoint| checkpoint.array("thickness", 4 << 24).map(<[u8]>::len);
+    assert!(n_bytes(&parts[0]).is_err() && n_bytes(&parts[1]).is_ok(), "it became finer between these steps");
+    let expected = state(&mut whole);
+    for part in parts {
+        let (mut resumed, _) = NerfModel::resume(gpu(), &part, &keyframes).unwrap();
+        learn(&mut resumed, END);
+        assert!(state(&mut resumed) == expected, "resumed from step {}", part.state["step"]);
+    }
+}
+
 /// Poses that drift from image to image are found along with the scene, where a trial says that it pays; stopping in its midst
 /// changes nothing.
 #[test]

@@ -95,8 +95,11 @@ pub(crate) fn loss_seen_along(field: &Field, ray: &Ray, direction: [f64; 3]) -> 
     ray::loss(&samples, &ray::composite(&samples), &ray.target, &WEIGHTS).0
 }
 
+/// Distance along a ray and slope of each of its samples.
+pub(crate) type Places = Vec<(f64, [f64; 3])>;
+
 /// Gradient by the parameters, by the places of the samples (with their distance along the ray), and by the image's code.
-pub(crate) fn gradient(field: &Field, ray: &Ray) -> (FieldGrad, Vec<(f64, [f64; 3])>, Vec<f64>) {
+pub(crate) fn gradient(field: &Field, ray: &Ray) -> (FieldGrad, Places, Vec<f64>) {
     let samples = samples(field, ray);
     let seen = ray::composite(&samples);
     let (_, upstream) = ray::loss(&samples, &seen, &ray.target, &WEIGHTS);
