@@ -217,10 +217,10 @@ impl Stands {
 
     /// Whether what is held waited for long enough at a time.
     fn is_overdue(&self, now: Stamp) -> bool {
-        let first_of = |mut held: Box<dyn Iterator<Item = &Keyframe> + '_>| held.next().map(|first| first.stamp);
-        match (first_of(Box::new(self.group())), first_of(Box::new(self.held_keyframes()))) {
-            (Some(since), _) => now.secs_since(since) > MOST_SCAN_SECS,
-            (None, Some(since)) => now.secs_since(since) > MOST_WALK_SECS,
+        let waited_secs = |first: Option<&Keyframe>| first.map(|first| now.secs_since(first.stamp));
+        match (waited_secs(self.group().next()), waited_secs(self.held_keyframes().next())) {
+            (Some(scan_secs), _) => scan_secs > MOST_SCAN_SECS,
+            (None, Some(walk_secs)) => walk_secs > MOST_WALK_SECS,
             (None, None) => false,
         }
     }

@@ -273,6 +273,7 @@ impl Method for NerfModel {
         self.held_back.retain(|image| !is_meant(image));
         if let Some(ix) = self.images.iter().position(is_meant) {
             self.settle()?;
+            self.give_up_trial();
             self.images.remove(ix);
             self.n_hinted -= usize::from(ix < self.n_hinted);
             self.fixes = None;

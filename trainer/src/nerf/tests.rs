@@ -272,6 +272,16 @@ fn poses_that_drift_are_found() {
     let mut loaded = NerfModel::load(gpu(), folder.path()).unwrap();
     assert_eq!(loaded.posed_lens(&wrong[3]).unwrap(), model.posed_lens(&wrong[3]).unwrap());
 
+    let mut loses_one = NerfModel::resume(gpu(), &checkpoint, &wrong).unwrap().0;
+    wrong.iter().filter(|keyframe| keyframe.split == Split::Selection).for_each(|keyframe| {
+        loses_one.push(keyframe.clone()).unwrap();
+    });
+    learn(&mut loses_one, 96);
+    loses_one.remove(&wrong[1].camera, wrong[1].stamp).unwrap();
+    let off_m = mean_off_m(&mut loses_one, &wrong);
+    assert!((off_m - before_m).abs() < 1e-12 && loses_one.report().is_empty(), "what was saved no longer fits");
+    learn(&mut loses_one, 120);
+
     // Images of which none is held back cannot decide.
     let mut unjudged = started(options(CameraChoice::Try(vec![poses])), &right);
     learn(&mut unjudged, 120);

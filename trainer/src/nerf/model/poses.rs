@@ -142,11 +142,14 @@ impl NerfModel {
         Ok(())
     }
 
-    /// A field that begins anew in the midst of a trial has nothing to compare.
+    /// A field that begins anew in the midst of a trial, or loses an image, has nothing to compare with what was saved.
     pub(super) fn give_up_trial(&mut self) {
         if matches!(self.trial, Trial::With { .. } | Trial::Without { .. }) {
             self.trial = Trial::Over;
             self.learns_poses = false;
+            if let Some((_, learner)) = &mut self.field {
+                learner.forget_poses();
+            }
             self.join_held_back();
         }
     }
