@@ -1,9 +1,11 @@
-//! What depth tells about where something is, before anything is learned.
+//! What images and their depth tell about where something may be, before anything is learned.
 
 use super::extent::Extent;
 use super::reference::march::March;
 use super::reference::space::largest;
-use crate::DepthMap;
+use crate::{DepthMap, Keyframe};
+use kinematics::Transform;
+use nalgebra::Vector3;
 use rayon::prelude::*;
 
 /// What is told of a cell, as in `hint_cells.wgsl`.
@@ -15,6 +17,8 @@ const NOWHERE: f64 = 50.0;
 /// Readings from one ray that is followed to the next: readings are told of every half cell, and so is where nothing was read, but what is
 /// empty before readings need be told once.
 const READINGS_PER_RAY: u32 = 4;
+/// Pixels to each side that tell a hole in what a depth camera read from what it cannot read.
+const HOLE_REACH_PX: u32 = 2;
 /// Share of the distance that a reading may be off by: so far in front of it nothing is taken for free.
 const OFF_FRAC: f64 = 0.03;
 
@@ -56,18 +60,51 @@ impl CellSet {
 /// Origin and direction of a ray, in units of the radius.
 type RayOf = ([f64; 3], [f64; 3]);
 
+/// Pixels from one ray that is followed to the next: half a cell apart a radius away.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
+fn stride_of(focal_px: [f64; 2], march: &March) -> u32 {
+    (2.0 / march.n_cells as f64 * focal_px[0]).clamp(1.0, 16.0) as u32
+}
+
+/// Whether a depth image shows what lies far away in a direction, given in the axes of another camera.
+fn sees(depth: &DepthMap, depth_from_camera: &Transform, along: Vector3<f64>) -> bool {
+    let along = depth_from_camera.rotation * along;
+    let is_inside = |axis: usize| {
+        let pixel = depth.focal_px[axis] * along[axis] / along.z + depth.principal_px[axis];
+        (0.0..f64::from(depth.size_px[axis])).contains(&pixel)
+    };
+    along.z > 0.0 && is_inside(0) && is_inside(1)
+}
+
+fn is_reading(z_m: f64) -> bool {
+    z_m.is_finite() && z_m > 0.0
+}
+
+/// Whether most pixels around one without reading have one: it says nothing then, and what lies behind the others is not seen through it.
+fn is_pinhole(depth: &DepthMap, [x, y]: [u32; 2]) -> bool {
+    let [width, height] = depth.size_px;
+    let around = |at: u32, size: u32| at.saturating_sub(HOLE_REACH_PX)..(at + HOLE_REACH_PX + 1).min(size);
+    let pixels = around(y, height).flat_map(|y| around(x, width).map(move |x| (y * width + x) as usize));
+    let (n, n_read) = pixels
+        .fold((0, 0), |(n, n_read), pixel| (n + 1, n_read + usize::from(is_reading(depth.depth_m[pixel].into()))));
+    2 * n_read > n
+}
+
 /// Of the cell around a point, drawn in as it is.
 fn cell_width(march: &March, point: [f64; 3]) -> f64 {
     4.0 / march.n_cells as f64 * largest(point).1.max(1.0).powi(2)
 }
 
-/// What depth images tell about cells, each told once.
-pub(crate) fn hints(depths: &[&DepthMap], extent: &Extent, march: &March) -> Vec<u32> {
+/// What images tell about cells, each told once; of cells that none of them looks at nothing is told.
+pub(crate) fn hints(keyframes: &[&Keyframe], extent: &Extent, march: &March) -> Vec<u32> {
     let none = || Cells::new(march.n_cells.pow(3));
-    let Cells { without_end, free, surfaces } = depths
+    let Cells { without_end, free, surfaces } = keyframes
         .par_iter()
-        .fold(none, |mut cells, depth| {
-            cells.look(depth, extent, march);
+        .fold(none, |mut cells, keyframe| {
+            if let Some(depth) = &keyframe.depth {
+                cells.look(depth, extent, march);
+            }
+            cells.look_beside_depth(keyframe, extent, march);
             cells
         })
         .reduce(none, Cells::and);
@@ -92,24 +129,43 @@ impl Cells {
 
     /// Takes note of a depth image.
     fn look(&mut self, depth: &DepthMap, extent: &Extent, march: &March) {
-        let cell_m = 4.0 * extent.radius_m / march.n_cells as f64;
-        // Rays that are half a cell apart a radius away.
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
-        let stride = (0.5 * cell_m / extent.radius_m * depth.focal_px[0]).clamp(1.0, 16.0) as u32;
+        let stride = stride_of(depth.focal_px, march);
         let origin = extent.in_units(&depth.world_from_camera).translation.vector.into();
         let [width, height] = depth.size_px;
         for y in (0..height).step_by(stride as usize) {
             for x in (0..width).step_by(stride as usize) {
                 let along = depth.point(x, y, 1.0);
                 let z_m = f64::from(depth.depth_m[(y * width + x) as usize]);
-                let reading_m = if z_m.is_finite() && z_m > 0.0 { z_m * along.norm() } else { 0.0 };
+                let reading_m = if is_reading(z_m) { z_m * along.norm() } else { 0.0 };
                 let ray = (origin, (depth.world_from_camera.rotation * along.normalize()).into());
                 let is_open = reading_m == 0.0;
+                if is_open && is_pinhole(depth, [x, y]) {
+                    continue;
+                }
                 if is_open || [x, y].into_iter().all(|at| (at / stride).is_multiple_of(READINGS_PER_RAY)) {
                     self.walk(march, ray, reading_m / extent.radius_m);
                 }
                 if !is_open {
                     self.meet(march, ray, reading_m / extent.radius_m);
+                }
+            }
+        }
+    }
+
+    /// Takes note of what a color image sees where its depth image does not look, as far away as nowhere is.
+    fn look_beside_depth(&mut self, keyframe: &Keyframe, extent: &Extent, march: &March) {
+        let Keyframe { size_px: [width, height], focal_px, principal_px, world_from_camera, depth, .. } = keyframe;
+        let depth = depth.as_ref().map(|depth| (depth, depth.world_from_camera.inverse() * world_from_camera));
+        let is_in_depth = |along: Vector3<f64>| depth.as_ref().is_some_and(|(depth, pose)| sees(depth, pose, along));
+        let stride = stride_of(*focal_px, march) as usize;
+        let origin = extent.in_units(world_from_camera).translation.vector.into();
+        for y in (0..*height).step_by(stride) {
+            for x in (0..*width).step_by(stride) {
+                let at = [x, y].map(|pixel| f64::from(pixel) + 0.5);
+                let [right, down] = [0, 1].map(|axis| (at[axis] - principal_px[axis]) / focal_px[axis]);
+                let along = Vector3::new(right, down, 1.0).normalize();
+                if !is_in_depth(along) {
+                    self.walk(march, (origin, (world_from_camera.rotation * along).into()), 0.0);
                 }
             }
         }

@@ -163,13 +163,13 @@ impl NerfModel {
         Ok(())
     }
 
-    /// Tells the field what the depth of new images says about where something is.
+    /// Tells the field what new images say about where something is, where any of them has depth.
     fn hint(&mut self) -> Result<(), Error> {
         let Some((extent, learner)) = &mut self.field else { return Ok(()) };
-        let march = learner.march();
-        let depths: Vec<_> =
-            self.images[self.n_hinted..].iter().filter_map(|image| image.keyframe.depth.as_ref()).collect();
-        learner.hint(&self.gpu, &carve::hints(&depths, extent, &march))?;
+        if learner.sizes.has_depth {
+            let keyframes: Vec<&Keyframe> = self.images[self.n_hinted..].iter().map(|image| &*image.keyframe).collect();
+            learner.hint(&self.gpu, &carve::hints(&keyframes, extent, &learner.march()))?;
+        }
         self.n_hinted = self.images.len();
         Ok(())
     }

@@ -431,7 +431,7 @@ fn depth_tells_which_cells_are_empty_and_which_hold_something() {
     let depth = keyframes[0].depth.as_ref().unwrap();
     let extent = Extent { center_m: AT.into(), radius_m: 1.0 };
     let march = March { step: 1.0 / 32.0, most_samples: 64, n_cells: 32 };
-    let hints = carve::hints(&[depth], &extent, &march);
+    let hints = carve::hints(&[&*keyframes[0]], &extent, &march);
     let told = |at: Point3<f64>| {
         let in_units: [f64; 3] = (at - AT).into();
         let cell = u32::try_from(march.cell(in_units).0).unwrap();
@@ -447,4 +447,36 @@ fn depth_tells_which_cells_are_empty_and_which_hold_something() {
     cells.sort_unstable();
     assert!(cells.windows(2).all(|pair| pair[0] != pair[1]), "a cell is told twice");
     assert!(hints.iter().any(|hint| hint >> 30 == 0), "beside the ball there is no end");
+}
+
+#[test]
+fn nothing_is_seen_through_a_hole_in_depth_but_colors_beside_it_see() {
+    let whole = ball(1).remove(0);
+    let extent = Extent { center_m: AT.into(), radius_m: 1.0 };
+    let march = March { step: 1.0 / 32.0, most_samples: 64, n_cells: 32 };
+    let inside = u32::try_from(march.cell([0.0; 3]).0).unwrap();
+    let told_inside = |depth: Option<DepthMap>| {
+        let keyframe = Keyframe { depth, ..(*whole).clone() };
+        let hints = carve::hints(&[&keyframe], &extent, &march);
+        hints.iter().filter(|hint| **hint & 0x3fff_ffff == inside).map(|hint| hint >> 30).max()
+    };
+    let depth = whole.depth.as_ref().unwrap();
+    let [width, height] = depth.size_px;
+    // Every third pixel along both axes, or a whole window, lacks its reading.
+    let punched = |is_hole: &dyn Fn(u32, u32) -> bool| {
+        let mut depth_m = depth.depth_m.to_vec();
+        for (ix, z_m) in (0..width * height).zip(&mut depth_m) {
+            if is_hole(ix % width, ix / width) {
+                *z_m = 0.0;
+            }
+        }
+        DepthMap { depth_m: depth_m.into(), ..depth.clone() }
+    };
+    assert_eq!(told_inside(Some(punched(&|x, y| x % 3 == 0 && y % 3 == 0))), None, "holes are looked through");
+    assert_eq!(told_inside(Some(punched(&|x, y| x.abs_diff(width / 2) < 12 && y.abs_diff(height / 2) < 12))), Some(0));
+    assert_eq!(told_inside(None), Some(0), "an image without depth sees nothing");
+    let [wide, _] = depth.focal_px.map(|focal| focal * 1e3);
+    let narrow = DepthMap { focal_px: [wide; 2], ..punched(&|_, _| false) };
+    let told_beside = carve::hints(&[&Keyframe { depth: Some(narrow), ..(*whole).clone() }], &extent, &march);
+    assert!(told_beside.iter().filter(|hint| **hint >> 30 == 0).count() > 500, "colors beside depth see nothing");
 }
