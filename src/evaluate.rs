@@ -105,14 +105,13 @@ impl Evaluator {
         })
     }
 
-    /// Scores all test keyframes.
-    pub(crate) fn score_all(
+    /// Scores test keyframes one after the other.
+    pub(crate) fn score_all<'a>(
         &self,
         method: &mut dyn Method,
-        tests: &[Arc<Keyframe>],
+        tests: impl Iterator<Item = &'a Arc<Keyframe>>,
     ) -> anyhow::Result<Vec<ImageScores>> {
         tests
-            .iter()
             .map(|keyframe| {
                 self.score(method, keyframe)
                     .with_context(|| format!("test image of {:?} at {} ns", keyframe.camera, keyframe.stamp.0))

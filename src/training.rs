@@ -35,7 +35,7 @@ pub(crate) fn train(
     let kind = plan.recipe.kind;
     let mut method = plan.recipe.start(gpu.clone())?;
     method.prepare()?;
-    let mut session = Session::new(gpu, (kind, method), plan.evaluators, plan.limits, plan.tell);
+    let mut session = Session::new(gpu, (kind, method), plan.evaluators, plan.limits, plan.tell).with_stop(stop);
     drive(std::slice::from_mut(&mut session), keyframes, learning, stop)?;
     Ok(session)
 }

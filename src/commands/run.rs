@@ -144,6 +144,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         let method = Recipe { kind, options: options.clone() }.start(gpu.clone())?;
         let tell = Tell::of_command(args.json);
         let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, tell)
+            .with_stop(&stop)
             .with_checkpoints(Checkpoints::new(folder, args.checkpoints))
             .with_decisions(decisions);
         sessions.push(if kinds.len() == 1 { session } else { session.among_others(clock.clone()) });

@@ -148,6 +148,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         }
         let tell = Tell::of_command(args.json);
         let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, tell)
+            .with_stop(&stop)
             .with_checkpoints(Checkpoints::new(folder, args.checkpoints))
             .with_profile(args.profile)
             .with_decisions(decisions);
