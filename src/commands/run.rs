@@ -137,6 +137,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             data: args.record.as_deref().or(args.from.as_deref()),
             adapter: gpu.describe(),
             scale: rig.train.scale,
+            depth_from: None,
             from_step: None,
             options: options.clone(),
         };
