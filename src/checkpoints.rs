@@ -30,6 +30,8 @@ pub(crate) fn read(folder: &Path) -> anyhow::Result<Checkpoint> {
 /// The checkpoints of one run; each replaces the one before.
 pub(crate) struct Checkpoints {
     path: PathBuf,
+    /// SHA-256 of the model that depth was drawn from.
+    depth_from: Option<String>,
     every: Duration,
     last: Instant,
     writing: Option<JoinHandle<Result<(), trainer::Error>>>,
@@ -38,8 +40,13 @@ pub(crate) struct Checkpoints {
 impl Checkpoints {
     /// None where they are not wanted. The first is due after the time between two.
     pub(crate) fn new(folder: &Path, args: CheckpointArgs) -> Option<Self> {
-        let every = args.checkpoint_secs;
-        (!every.is_zero()).then(|| Self { path: folder.join(CHECKPOINT), every, last: Instant::now(), writing: None })
+        let (every, path) = (args.checkpoint_secs, folder.join(CHECKPOINT));
+        (!every.is_zero()).then(|| Self { path, depth_from: None, every, last: Instant::now(), writing: None })
+    }
+
+    /// Says in each whose depth was drawn, by the SHA-256 of that model.
+    pub(crate) fn with_depth_from(self, sha256: Option<String>) -> Self {
+        Self { depth_from: sha256, ..self }
     }
 
     /// Begins one when it is due and the one before is written, and says so. A disk that refuses one does not stop training.
@@ -62,8 +69,8 @@ impl Checkpoints {
         let asked = Instant::now();
         let pending = method.checkpoint()?;
         log::debug!("a checkpoint held training up for {:?}", asked.elapsed());
-        let path = self.path.clone();
-        self.writing = Some(std::thread::spawn(move || write(pending, seconds, &path)));
+        let (path, depth_from) = (self.path.clone(), self.depth_from.clone());
+        self.writing = Some(std::thread::spawn(move || write(pending, seconds, depth_from, &path)));
         self.last = Instant::now();
         Ok(())
     }
@@ -78,9 +85,14 @@ impl Checkpoints {
     }
 }
 
-fn write(pending: PendingCheckpoint, seconds: f64, path: &Path) -> Result<(), trainer::Error> {
+fn write(
+    pending: PendingCheckpoint,
+    seconds: f64,
+    depth_from: Option<String>,
+    path: &Path,
+) -> Result<(), trainer::Error> {
     let begun = Instant::now();
-    Checkpoint { seconds, ..pending.finish()? }.write(path)?;
+    Checkpoint { seconds, depth_from, ..pending.finish()? }.write(path)?;
     log::debug!("a checkpoint was written in {:?}", begun.elapsed());
     Ok(())
 }

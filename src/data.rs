@@ -2,6 +2,7 @@
 
 use crate::config::{Override, Rig};
 use crate::dataset;
+use crate::depth_from::{DepthSource, DrawnDepth};
 use crate::exit::{BadArgument, LackOfEvidence};
 use crate::holdout::Holdout;
 use crate::join::{Join, JoinEvent, KeyframeList, Use};
@@ -11,7 +12,8 @@ use crate::{print, shrink};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
+use trainer::gpu::Gpu;
 use trainer::{Keyframe, Split};
 
 /// Ending of a recording.
@@ -48,7 +50,9 @@ pub(crate) struct Data {
     pub(crate) losses: Vec<String>,
     /// What was found of the base's pose at each stand after the first.
     pub(crate) stands: Vec<StandReport>,
-    /// Time that finding it took: it was learned from the images.
+    /// What was drawn from a model for images that lack depth.
+    pub(crate) drawn_depth: Option<DrawnDepth>,
+    /// Time that finding the stands and drawing depth took: both come before learning, for the sake of it.
     pub(crate) learning: Duration,
 }
 
@@ -158,6 +162,14 @@ impl Data {
         self.keyframes.iter().any(|keyframe| keyframe.depth.is_some())
     }
 
+    /// Gives images without depth that of a model.
+    pub(crate) fn draw_depth(&mut self, gpu: Arc<Gpu>, source: &DepthSource, quiet: bool) -> anyhow::Result<()> {
+        let begun = Instant::now();
+        self.drawn_depth = Some(source.draw(gpu, &mut self.keyframes, quiet)?);
+        self.learning += begun.elapsed();
+        Ok(())
+    }
+
     fn from_folder(
         path: &Path,
         holdout: &Holdout,
@@ -180,6 +192,7 @@ impl Data {
             has_times: folder.has_times(),
             losses: loaded.losses,
             stands: Vec::new(),
+            drawn_depth: None,
             learning: Duration::ZERO,
         };
         if let Some(list) = list {
@@ -231,6 +244,7 @@ impl Data {
             has_times: true,
             losses,
             stands: Vec::new(),
+            drawn_depth: None,
             learning: Duration::ZERO,
         })
     }

@@ -36,6 +36,9 @@ pub(crate) struct Settings {
     pub(crate) adapter: String,
     /// Share of the width and height that images were shrunk to.
     pub(crate) scale: f64,
+    /// SHA-256 of the model that depth was drawn from for images without; none where there was no such model.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) depth_from: Option<String>,
     /// Updates made before, where it went on from a checkpoint.
     pub(crate) from_step: Option<u64>,
     pub(crate) options: SplatOptions,
@@ -47,6 +50,7 @@ pub(crate) struct About<'a> {
     pub(crate) data: Option<&'a Path>,
     pub(crate) adapter: String,
     pub(crate) scale: f64,
+    pub(crate) depth_from: Option<String>,
     pub(crate) from_step: Option<u64>,
     pub(crate) options: SplatOptions,
 }
@@ -60,6 +64,7 @@ impl Settings {
             data: about.data.and_then(name),
             adapter: about.adapter,
             scale: about.scale,
+            depth_from: about.depth_from,
             from_step: about.from_step,
             options: about.options,
         }
@@ -380,6 +385,7 @@ mod tests {
             data: Some(Path::new("somewhere/scan.mcap")),
             adapter: "llvmpipe".to_owned(),
             scale: 0.5,
+            depth_from: from_step.map(|_| "5ad1".to_owned()),
             from_step,
             options: SplatOptions { seed: 7, max_bytes: Some(5_000_000), ..SplatOptions::default() },
         })

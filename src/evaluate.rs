@@ -105,14 +105,13 @@ impl Evaluator {
         })
     }
 
-    /// Scores all test keyframes.
-    pub(crate) fn score_all(
+    /// Scores test keyframes one after the other.
+    pub(crate) fn score_all<'a>(
         &self,
         method: &mut dyn Method,
-        tests: &[Arc<Keyframe>],
+        tests: impl Iterator<Item = &'a Arc<Keyframe>>,
     ) -> anyhow::Result<Vec<ImageScores>> {
         tests
-            .iter()
             .map(|keyframe| {
                 self.score(method, keyframe)
                     .with_context(|| format!("test image of {:?} at {} ns", keyframe.camera, keyframe.stamp.0))
@@ -189,6 +188,21 @@ pub(crate) fn draw(method: &mut dyn Method, keyframe: &Keyframe) -> Result<Pictu
     Ok(picture)
 }
 
+/// The picture a model shows where a keyframe's depth was taken, which has its own size, lens and pose; `None` without depth.
+pub(crate) fn draw_depth(method: &mut dyn Method, keyframe: &Keyframe) -> Result<Option<Picture>, trainer::Error> {
+    let Some(depth) = &keyframe.depth else { return Ok(None) };
+    let lens = method.posed_lens(keyframe)?;
+    let Some(color_from_depth) = lens.color_from_depth else { return Ok(None) };
+    let drawn = method.render(&RenderRequest {
+        world_from_camera: lens.world_from_camera * color_from_depth,
+        size_px: depth.size_px,
+        projection: Projection::Pinhole { focal_px: depth.focal_px, principal_px: depth.principal_px },
+        shutter: None,
+        ..request(keyframe, &lens)
+    })?;
+    Ok(Some(drawn))
+}
+
 /// What each value of a color becomes when multiplied.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to a byte")]
 fn exposed(gain: f64) -> [u8; 256] {
@@ -215,18 +229,10 @@ struct DepthError {
     surface: Option<SurfaceError>,
 }
 
-/// Depth has its own size, lens and pose, so it is drawn on its own.
 fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<DepthError> {
-    let Some(depth) = &keyframe.depth else { return Ok(DepthError::default()) };
-    let lens = method.posed_lens(keyframe)?;
-    let Some(color_from_depth) = lens.color_from_depth else { return Ok(DepthError::default()) };
-    let drawn = method.render(&RenderRequest {
-        world_from_camera: lens.world_from_camera * color_from_depth,
-        size_px: depth.size_px,
-        projection: Projection::Pinhole { focal_px: depth.focal_px, principal_px: depth.principal_px },
-        shutter: None,
-        ..request(keyframe, &lens)
-    })?;
+    let (Some(depth), Some(drawn)) = (&keyframe.depth, draw_depth(method, keyframe)?) else {
+        return Ok(DepthError::default());
+    };
     Ok(DepthError {
         rmse_m: depth_rmse_m(&drawn.depth_m, &depth.depth_m)?,
         surface: surface_error(&drawn.depth_m, depth)?,

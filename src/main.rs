@@ -12,6 +12,7 @@ mod corrected_rig;
 mod data;
 mod dataset;
 mod decisions;
+mod depth_from;
 mod evaluate;
 mod exit;
 mod export;

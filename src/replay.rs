@@ -3,6 +3,7 @@
 use crate::config::Override;
 use crate::data::Data;
 use crate::decisions::{Decision, Decisions, Pushed};
+use crate::depth_from;
 use crate::exit::{BadArgument, LackOfEvidence};
 use crate::join::KeyframeList;
 use crate::method::{Kind, Recipe};
@@ -38,7 +39,7 @@ impl Replay {
         Ok(replay)
     }
 
-    /// Loads exactly the keyframes that the log names, and checks that they are the same.
+    /// Loads exactly the keyframes that the log names; [`Self::check_data`] checks that they are the same.
     pub(crate) fn load_data(&self, path: &Path, rig: Option<PathBuf>, quiet: bool) -> anyhow::Result<Data> {
         let pushed = || self.decisions.pushed();
         let list: KeyframeList = pushed()
@@ -52,28 +53,37 @@ impl Replay {
                 *keyframe = pushed.placed(keyframe);
             }
         }
+        if !self.decisions.is_whole() {
+            let last = self.decisions.entries.last().map_or(0, |entry| entry.step);
+            let name = self.name();
+            data.losses.push(format!("{name} is cut off: its run is repeated up to step {last}, the last it tells of"));
+        }
+        Ok(data)
+    }
+
+    /// Refuses data that lack a keyframe of the log, or have another one in its place.
+    pub(crate) fn check_data(&self, path: &Path, data: &Data) -> Result<(), LackOfEvidence> {
         let there = by_name(&data.keyframes);
         let (name, shown) = (self.name(), path.display());
-        for pushed in pushed() {
+        for pushed in self.decisions.pushed() {
             let (camera, stamp) = (&*pushed.camera, pushed.stamp_nanos);
             let Some(keyframe) = there.get(&(camera, stamp)) else {
                 return Err(LackOfEvidence(format!(
                     "{name} names image {stamp} of camera {camera:?}, which {shown} does not have"
-                ))
-                .into());
+                )));
             };
             if !pushed.is_like(keyframe) {
                 return Err(LackOfEvidence(format!(
                     "image {stamp} of camera {camera:?} has other pixels, depth, lens or pose in {shown} than {name} was written with"
-                ))
-                .into());
+                )));
             }
         }
-        if !self.decisions.is_whole() {
-            let last = self.decisions.entries.last().map_or(0, |entry| entry.step);
-            data.losses.push(format!("{name} is cut off: its run is repeated up to step {last}, the last it tells of"));
-        }
-        Ok(data)
+        Ok(())
+    }
+
+    /// Refuses to repeat a run whose images had depth drawn from another model than this one, known by its SHA-256.
+    pub(crate) fn check_depth_from(&self, sha256: Option<&str>) -> Result<(), BadArgument> {
+        depth_from::check_same(&self.name(), self.decisions.settings.depth_from.as_deref(), sha256)
     }
 
     /// Refuses a model that is not where the log begins; `from_step`: updates made before, where it goes on from a checkpoint.

@@ -164,7 +164,12 @@ pub(crate) fn checkpoint_sha256(folder: &Path) -> anyhow::Result<String> {
         n_files += 1;
     }
     ensure!(n_files > 0, "{} holds no model", folder.display());
-    Ok(hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
+    Ok(hex(&hash.finalize()))
+}
+
+/// Bytes as people write them.
+pub(crate) fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// `20261121-093000` for a time since 1970, UTC.

@@ -7,6 +7,7 @@ use crate::decisions::DecisionLog;
 use crate::evaluate::{Evaluator, ImageScores, Scores};
 use crate::marks::Marks;
 use crate::method::Kind;
+use crate::stop::Stop;
 use crate::turns::TURN;
 use crate::{print, run_folder};
 use indicatif::ProgressBar;
@@ -102,6 +103,8 @@ pub(crate) struct Session {
     /// Newest PSNR of each test keyframe, by camera and stamp.
     newest_psnr: BTreeMap<(String, i64), f64>,
     tell: Tell,
+    /// Whether somebody wants an end: a mark is not worth waiting for then.
+    stop: Stop,
     profiles: bool,
     bar: ProgressBar,
 }
@@ -224,6 +227,7 @@ impl Session {
             history: Vec::new(),
             newest_psnr: BTreeMap::new(),
             tell,
+            stop: Stop::default(),
             profiles: false,
             bar: print::bar(length, template, matches!(tell, Tell::Json | Tell::Nothing)),
         }
@@ -232,6 +236,11 @@ impl Session {
     /// Writes checkpoints, if any, from now on.
     pub(crate) fn with_checkpoints(self, checkpoints: Option<Checkpoints>) -> Self {
         Self { checkpoints, ..self }
+    }
+
+    /// Cuts the scoring at a mark short where the end is asked for meanwhile; the mark is not told then.
+    pub(crate) fn with_stop(self, stop: &Stop) -> Self {
+        Self { stop: stop.clone(), ..self }
     }
 
     /// Tells at the end what each pass of a step takes, if asked to.
@@ -556,7 +565,7 @@ impl Session {
 
     fn score_at_end(&mut self, seconds: f64) -> anyhow::Result<Outcome> {
         std::mem::swap(&mut self.evaluator, &mut self.last_evaluator);
-        let per_image = self.score(usize::MAX)?;
+        let per_image = self.score(usize::MAX, &Stop::default())?.unwrap_or_default();
         let progress = self.method.progress();
         Ok(Outcome {
             seconds,
@@ -569,24 +578,26 @@ impl Session {
         })
     }
 
-    /// Scores at most `most` test keyframes, off the clock.
-    fn score(&mut self, most: usize) -> anyhow::Result<Vec<ImageScores>> {
+    /// Scores at most `most` test keyframes, off the clock; `None` where `stop` was asked before all were drawn.
+    fn score(&mut self, most: usize, stop: &Stop) -> anyhow::Result<Option<Vec<ImageScores>>> {
         self.gpu.wait()?;
         self.note_look();
         let before = Instant::now();
         let stride = self.tests.len().div_ceil(most).max(1);
         let tests: Vec<Arc<Keyframe>> = self.tests.iter().step_by(stride).cloned().collect();
-        let images = self.evaluator.score_all(self.method.as_mut(), &tests)?;
+        let wanted = tests.iter().take_while(|_| !stop.asked());
+        let images = self.evaluator.score_all(self.method.as_mut(), wanted)?;
         self.gpu.wait()?;
         self.clock.exclude(before.elapsed());
-        Ok(images)
+        Ok((images.len() == tests.len()).then_some(images))
     }
 
     fn tell_mark(&mut self) -> anyhow::Result<()> {
         // What was queued up to here belongs to the mark.
         self.gpu.wait()?;
         let seconds = self.secs();
-        let images = self.score(self.most_at_marks)?;
+        let stop = self.stop.clone();
+        let Some(images) = self.score(self.most_at_marks, &stop)? else { return Ok(()) };
         for image in &images {
             self.newest_psnr.insert((image.camera.clone(), image.stamp_nanos), image.psnr);
         }

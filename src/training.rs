@@ -35,7 +35,7 @@ pub(crate) fn train(
     let kind = plan.recipe.kind;
     let mut method = plan.recipe.start(gpu.clone())?;
     method.prepare()?;
-    let mut session = Session::new(gpu, (kind, method), plan.evaluators, plan.limits, plan.tell);
+    let mut session = Session::new(gpu, (kind, method), plan.evaluators, plan.limits, plan.tell).with_stop(stop);
     drive(std::slice::from_mut(&mut session), keyframes, learning, stop)?;
     Ok(session)
 }
@@ -86,7 +86,8 @@ pub(crate) fn recipes(
     let evidence = Evidence {
         joints: data.rig.is_some(),
         drifts: data.rig.as_ref().is_none_or(Rig::has_moving_base),
-        depth: data.has_depth(),
+        // Depth drawn from where a camera is told to be does not say where it is.
+        depth: data.has_depth() && data.drawn_depth.as_ref().is_none_or(|drawn| drawn.n_images == 0),
     };
     let Refining { align, learn: cameras } =
         args.refining(evidence, if software { Refine::None } else { Refine::Auto })?;

@@ -42,7 +42,8 @@ pub(crate) struct Methods(Vec<Kind>);
 fn methods(text: &str) -> Result<Methods, String> {
     let mut kinds = Vec::new();
     for name in text.split(',') {
-        let kind = Kind::named(name).ok_or_else(|| format!("there is no {name:?}, only splat, nerf and tsdf"))?;
+        let kind =
+            Kind::named(name).ok_or_else(|| format!("there is no {name:?}, only {}", method::in_words(&Kind::ALL)))?;
         if kinds.contains(&kind) {
             return Err(format!("{name} stands there twice"));
         }

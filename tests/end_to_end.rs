@@ -201,22 +201,30 @@ fn several_methods_grow_live_as_each_does_alone_and_a_viewer_chooses() {
     let rig = |file: &str| std::fs::read_to_string(folder.join(file)).expect("a settled rig file");
     assert!(rig("both/rig.toml").contains("method = [") && rig("both/splat/rig.toml").contains("method = \"splat\""));
 
-    let mut run = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
-        .args(["run", "rig.toml", "--from", "scan.mcap", "--method", "tsdf,splat"])
-        .args(["--steps-per-keyframe", "1", "--out", "seen", "--listen", "127.0.0.1:0", "--json"])
-        .current_dir(folder)
-        .stdout(Stdio::piped())
-        .spawn()
-        .expect("fieldrig starts");
+    let args = ["run", "rig.toml", "--from", "scan.mcap", "--method", "tsdf,splat"];
+    let common = ["--steps-per-keyframe", "1", "--out", "seen", "--listen", "127.0.0.1:0", "--json"];
+    let told = interrupted(folder, &[&args[..], &common].concat(), |serving| {
+        looks_at_each(serving["url"].as_str().expect("an address"));
+    });
+    assert_eq!(told.iter().filter(|event| event["event"] == "done").count(), 2);
+}
+
+/// Runs a command that serves, and asks for its end, as Ctrl-C does, once it told a score; what it told from there on comes
+/// back. `meanwhile` is given what it told first.
+fn interrupted(folder: &Path, args: &[&str], meanwhile: impl FnOnce(&Value)) -> Vec<Value> {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
+    let mut run = command.args(args).current_dir(folder).stdout(Stdio::piped()).spawn().expect("fieldrig starts");
     let mut lines = BufReader::new(run.stdout.take().expect("piped")).lines();
     let mut event = || -> Option<Value> { serde_json::from_str(&lines.next()?.expect("a line")).ok() };
     let serving = event().expect("the address");
     while event().expect("an event before the end")["event"] != "eval" {}
-    looks_at_each(serving["url"].as_str().expect("an address"));
-    let interrupted = Command::new("sh").args(["-c", &format!("kill -INT {}", run.id())]).status().expect("sh starts");
-    assert!(interrupted.success());
-    let done = std::iter::from_fn(event).filter(|event| event["event"] == "done").count();
-    assert_eq!((run.wait().expect("it ends").code(), done), (Some(0), 2));
+    meanwhile(&serving);
+    // The shell's own `kill`: a bare system has no other.
+    let asked = Command::new("sh").args(["-c", &format!("kill -INT {}", run.id())]).status().expect("sh starts");
+    assert!(asked.success());
+    let told = std::iter::from_fn(event).collect();
+    assert_eq!(run.wait().expect("it ends").code(), Some(0));
+    told
 }
 
 /// Asks for a picture of each model there is, and of one that is not there.
@@ -352,32 +360,9 @@ fn an_interrupted_run_saves_model_and_recording() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     rig_file(folder);
-    let mut run = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
-        .args([
-            "run",
-            "rig.toml",
-            "--sim",
-            "--record",
-            "scan.mcap",
-            "--out",
-            "cut",
-            "--listen",
-            "127.0.0.1:0",
-            "--json",
-        ])
-        .current_dir(folder)
-        .stdout(Stdio::piped())
-        .spawn()
-        .expect("fieldrig starts");
-    let mut lines = BufReader::new(run.stdout.take().expect("piped")).lines();
-    let mut event = || -> Option<Value> { serde_json::from_str(&lines.next()?.expect("a line")).ok() };
-    while event().expect("an event before the end")["event"] != "eval" {}
-    // The shell's own `kill`: a bare system has no other.
-    let interrupted = Command::new("sh").args(["-c", &format!("kill -INT {}", run.id())]).status().expect("sh starts");
-    assert!(interrupted.success());
-    let last = std::iter::from_fn(event).last().expect("a last event");
-    assert_eq!(last["event"], "done");
-    assert_eq!(run.wait().expect("it ends").code(), Some(0));
+    let run = ["run", "rig.toml", "--sim", "--record", "scan.mcap", "--out", "cut"];
+    let told = interrupted(folder, &[&run[..], &["--listen", "127.0.0.1:0", "--json"]].concat(), |_| {});
+    assert_eq!(told.last().expect("events")["event"], "done");
     assert!(folder.join("cut/splats.ply").is_file());
     let replayed = fieldrig(folder, &["train", "scan.mcap", "--steps", "1", "--out", "again"]);
     assert!(replayed.status.success(), "{}", String::from_utf8_lossy(&replayed.stderr));

@@ -159,7 +159,7 @@ fn methods_that_make_no_sense_are_refused_in_one_sentence() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     for (methods, word) in
-        [("splat,mesh", "\"mesh\""), ("tsdf,splat,tsdf", "tsdf stands there twice"), ("", "splat, nerf")]
+        [("splat,mesh", "\"mesh\""), ("tsdf,splat,tsdf", "tsdf stands there twice"), ("", "splat, tsdf and nerf")]
     {
         refused(folder, &["train", "data", "--method", methods], &["--method", word]);
         refused(folder, &["run", "rig.toml", "--method", methods], &["--method", word]);

@@ -59,7 +59,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         );
     }
     let mut model = method::load(super::open_gpu()?, &args.model)?;
-    let images = evaluator.score_all(model.as_mut(), &tests)?;
+    let images = evaluator.score_all(model.as_mut(), tests.iter())?;
     let scores = Scores::mean(&images);
     let is_test = |keyframe: &Keyframe| keyframe.split == Split::Test;
     let names = data.keyframes.iter().zip(data.names).filter(|(keyframe, _)| is_test(keyframe)).map(|(_, name)| name);

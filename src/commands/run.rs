@@ -137,6 +137,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             data: args.record.as_deref().or(args.from.as_deref()),
             adapter: gpu.describe(),
             scale: rig.train.scale,
+            depth_from: None,
             from_step: None,
             options: options.clone(),
         };
@@ -144,6 +145,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         let method = Recipe { kind, options: options.clone() }.start(gpu.clone())?;
         let tell = Tell::of_command(args.json);
         let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, tell)
+            .with_stop(&stop)
             .with_checkpoints(Checkpoints::new(folder, args.checkpoints))
             .with_decisions(decisions);
         sessions.push(if kinds.len() == 1 { session } else { session.among_others(clock.clone()) });

@@ -6,6 +6,7 @@ use crate::config::Rig;
 use crate::corrected_rig;
 use crate::data::{Data, DataArgs, Purpose};
 use crate::decisions::{About, DecisionLog, Settings};
+use crate::depth_from::{self, DepthSource, DrawnDepth};
 use crate::evaluate::Evaluator;
 use crate::exit::{self, BadArgument, Exit};
 use crate::method::{self, Kind, Recipe, Resumed};
@@ -54,6 +55,10 @@ pub(crate) struct Args {
     plan_steps: Option<u64>,
     #[command(flatten)]
     images: DataArgs,
+    /// Where images have no depth, or on less than half of them, draw it from this saved model (a folder, or a file of splats)
+    /// of the same place in the same world frame: all methods take it for measured. What --refine finds is learned with the scene then
+    #[arg(long, value_name = "MODEL")]
+    depth_from: Option<PathBuf>,
     /// Weights of LPIPS for `SqueezeNet` (safetensors) [default: what `FIELDRIG_LPIPS_WEIGHTS` names; none: no LPIPS]
     #[arg(long, value_name = "FILE")]
     lpips_weights: Option<PathBuf>,
@@ -86,6 +91,9 @@ struct Particulars<'a> {
     losses: &'a [String],
     /// What was found of the base's pose at each stand after the first.
     stands: &'a [StandReport],
+    /// How much depth came from a model.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    drawn_depth: Option<&'a DrawnDepth>,
     /// What was found about cameras by laying images over each other.
     alignment: Option<Alignment>,
 }
@@ -103,9 +111,18 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     let stop = Stop::on_ctrl_c()?;
     let checkpoint = args.resume.as_deref().map(checkpoints::read).transpose()?;
+    let depth_from = args.depth_from.as_deref().map(DepthSource::find).transpose()?;
+    let depth_sum = depth_from.as_ref().map(|source| source.sha256.as_str());
+    if let Some(replay) = &replay {
+        replay.check_depth_from(depth_sum)?;
+    }
+    if let (Some(checkpoint), Some(folder)) = (&checkpoint, &args.resume) {
+        let whose = format!("the checkpoint in {}", folder.display());
+        depth_from::check_same(&whose, checkpoint.depth_from.as_deref(), depth_sum)?;
+    }
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
     let evaluators = Evaluators { at_marks: evaluator.clone(), most_at_marks: usize::MAX, at_end: evaluator };
-    let data = match &replay {
+    let mut data = match &replay {
         Some(replay) => replay.load_data(&args.data, args.images.rig.clone(), args.json)?,
         None => Data::load(&args.data, &args.images, Purpose::Training, &args.training.overrides(), args.json)?,
     };
@@ -117,6 +134,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         corrected_rig::refuse_place(rig, file)?; // Not after all the training.
     }
     let gpu = super::open_gpu()?;
+    if let Some(source) = &depth_from {
+        data.draw_depth(gpu.clone(), source, args.json)?;
+    }
+    if let Some(replay) = &replay {
+        replay.check_data(&args.data, &data)?;
+    }
     let mut models = args.models(&gpu, &data, replay.as_ref(), checkpoint.as_ref())?;
     let from_step = checkpoint.is_some().then(|| models[0].method.n_taken()).transpose()?;
     if let Some(replay) = &replay {
@@ -139,6 +162,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             data: Some(&args.data),
             adapter: gpu.describe(),
             scale: args.scale(&data, replay.as_ref()),
+            depth_from: depth_sum.map(str::to_owned),
             from_step,
             options,
         };
@@ -147,8 +171,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             decisions.had(from_step.unwrap_or_default(), keyframe);
         }
         let tell = Tell::of_command(args.json);
+        let checkpoints = Checkpoints::new(folder, args.checkpoints);
         let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, tell)
-            .with_checkpoints(Checkpoints::new(folder, args.checkpoints))
+            .with_stop(&stop)
+            .with_checkpoints(checkpoints.map(|to| to.with_depth_from(depth_sum.map(str::to_owned))))
             .with_profile(args.profile)
             .with_decisions(decisions);
         sessions.push(match (&kinds[..], &checkpoint) {
@@ -157,7 +183,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             _ => session.among_others(clock.clone()),
         });
     }
-    // What was found of the base's stands counts once.
+    // What was found of the base's stands and drawn for depth counts once.
     let learning = if checkpoint.is_some() { Duration::ZERO } else { data.learning };
     match &replay {
         Some(replay) => replay.drive(&mut sessions[0], &rest, &stop)?,
@@ -177,6 +203,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             n_test: data.of_split(Split::Test).len(),
             losses: &data.losses,
             stands: &data.stands,
+            drawn_depth: data.drawn_depth.as_ref(),
             alignment: session.alignment().cloned(),
         },
         session,

@@ -30,7 +30,6 @@ pub(super) const SCANNER_DRIVERS: [(&str, ScannerDriver); 2] =
     [("udp", ScannerDriver::Udp), ("sim", ScannerDriver::Sim)];
 pub(super) const PARENTS: [(&str, Parent); 3] =
     [("flange", Parent::Flange), ("base", Parent::Base), ("world", Parent::World)];
-const METHODS: [(&str, Kind); 3] = [("splat", Kind::Splat), ("nerf", Kind::Nerf), ("tsdf", Kind::Tsdf)];
 /// Where base poses and range scans are listened for where nothing says otherwise: of this computer only.
 const USUAL_BASE_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7009);
 const USUAL_SCANNER_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7010);
@@ -372,7 +371,9 @@ fn join(mut keys: Section<'_>) -> JoinConfig {
 
 fn train(mut keys: Section<'_>) -> Train {
     let train = Train {
-        methods: keys.choices("method", &METHODS).unwrap_or_else(|| vec![Kind::Splat]),
+        methods: keys
+            .choices("method", &Kind::ALL.map(|kind| (kind.name(), kind)))
+            .unwrap_or_else(|| vec![Kind::Splat]),
         max_splats: keys.whole("max_splats", MAX_SPLATS),
         max_bytes: keys.whole("max_bytes", MAX_BYTES),
         seed: keys.whole("seed", SEED).unwrap_or(USUAL_SEED),

@@ -24,6 +24,8 @@ pub struct Checkpoint {
     pub method: String,
     /// Seconds it had been trained for.
     pub seconds: f64,
+    /// SHA-256 of the model that keyframes without depth had theirs drawn from, where there was one.
+    pub depth_from: Option<String>,
     /// The method's state but for its arrays.
     pub state: serde_json::Value,
     /// What is too large for a description, little endian.
@@ -48,6 +50,8 @@ pub struct PendingCheckpoint(Box<dyn FnOnce() -> Result<Checkpoint, Error> + Sen
 struct Description {
     method: String,
     seconds: f64,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    depth_from: Option<String>,
     state: serde_json::Value,
     arrays: Vec<Length>,
 }
@@ -77,6 +81,11 @@ impl Debug for PendingCheckpoint {
 }
 
 impl Checkpoint {
+    /// What a method tells of itself; how long it had been trained for, and on what, is for its caller to say.
+    pub(crate) fn new(method: &str, state: serde_json::Value, arrays: Vec<Array>) -> Self {
+        Self { method: method.to_owned(), seconds: 0.0, depth_from: None, state, arrays }
+    }
+
     /// Writes the file beside its place, waits until the disk has it, and moves it there: whatever happens, either the
     /// previous file or this one is under the name, whole.
     pub fn write(&self, path: &Path) -> Result<(), Error> {
@@ -120,8 +129,13 @@ impl Checkpoint {
     fn write_to(&self, file: &mut impl Write) -> std::io::Result<()> {
         let lengths =
             self.arrays.iter().map(|array| Length { name: array.name.clone(), bytes: array.bytes.len() as u64 });
-        let (method, seconds, state) = (self.method.clone(), self.seconds, self.state.clone());
-        let description = serde_json::to_vec(&Description { method, seconds, state, arrays: lengths.collect() })?;
+        let description = serde_json::to_vec(&Description {
+            method: self.method.clone(),
+            seconds: self.seconds,
+            depth_from: self.depth_from.clone(),
+            state: self.state.clone(),
+            arrays: lengths.collect(),
+        })?;
         let n_bytes = u32::try_from(description.len()).map_err(std::io::Error::other)?;
         let front = [&MAGIC[..], &VERSION.to_le_bytes(), &n_bytes.to_le_bytes()].concat();
         let mut sum = Sha256::new();
@@ -167,7 +181,8 @@ impl Checkpoint {
             arrays.push(Array { name, bytes: array.to_vec() });
             rest = after;
         }
-        Ok(Self { method: description.method, seconds: description.seconds, state: description.state, arrays })
+        let Description { method, seconds, depth_from, state, .. } = description;
+        Ok(Self { method, seconds, depth_from, state, arrays })
     }
 }
 
@@ -180,6 +195,7 @@ mod tests {
         Checkpoint {
             method: "splat".into(),
             seconds: 0.1 + 0.2,
+            depth_from: Some("5ad1".into()),
             state: serde_json::json!({ "step": u64::MAX, "size_m": 1.0 / 3.0 }),
             arrays: arrays.map(|(name, bytes)| Array { name: name.into(), bytes }).into(),
         }
@@ -207,7 +223,7 @@ mod tests {
 
     #[test]
     fn the_layout_is_the_documented_one() {
-        let empty = Checkpoint { method: "m".into(), seconds: 0.0, state: 7.into(), arrays: Vec::new() };
+        let empty = Checkpoint::new("m", 7.into(), Vec::new());
         let bytes = bytes_of(&empty);
         let json = r#"{"method":"m","seconds":0.0,"state":7,"arrays":[]}"#;
         assert_eq!(bytes[..16], *b"FRIGCKPT\x01\0\0\0\x32\0\0\0");

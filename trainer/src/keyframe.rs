@@ -61,6 +61,14 @@ pub struct Keyframe {
 }
 
 impl Keyframe {
+    /// Whether depth tells nothing about most of the image: it has none, or that of a scanner, which sees a band.
+    pub fn is_bare(&self) -> bool {
+        self.depth.as_ref().is_none_or(|depth| {
+            let n_known = depth.depth_m.iter().filter(|z| **z > 0.0).count();
+            2 * n_known < depth.depth_m.len()
+        })
+    }
+
     /// Refuses arrays that do not have their pixels.
     pub(crate) fn check(&self) -> Result<(), Error> {
         let [width, height] = self.size_px;

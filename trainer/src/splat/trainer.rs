@@ -345,7 +345,7 @@ impl SplatTrainer {
         self.measure_scene();
         let discs = self.seeder.discs(&pending, self.density());
         self.add(&discs)?;
-        self.unseeded.extend(pending.into_iter().filter(|keyframe| is_bare(keyframe)));
+        self.unseeded.extend(pending.into_iter().filter(|keyframe| keyframe.is_bare()));
         Ok(())
     }
 
@@ -940,14 +940,6 @@ type Fixes = BTreeMap<String, CameraFix>;
 /// The camera of a keyframe as it is, where the input has it as [`PosedLens::of`].
 fn fixed(fixes: &Fixes, keyframe: &Keyframe) -> PosedLens {
     fixes.get(keyframe.camera.as_ref()).map_or_else(|| PosedLens::of(keyframe), |fix| fix.apply(keyframe))
-}
-
-/// Whether depth tells nothing about most of the image: a scanner sees a band of it.
-fn is_bare(keyframe: &Keyframe) -> bool {
-    keyframe.depth.as_ref().is_none_or(|depth| {
-        let n_known = depth.depth_m.iter().filter(|z| **z > 0.0).count();
-        2 * n_known < depth.depth_m.len()
-    })
 }
 
 /// What a saved model knows about cameras.

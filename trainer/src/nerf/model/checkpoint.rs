@@ -148,15 +148,11 @@ impl NerfModel {
         if let Trial::With { before } | Trial::Without { before, .. } = &self.trial {
             (state.step, state.learns_poses, state.n_poses) = (before.step, false, None);
             let (state, arrays) = (written(&state)?, before.arrays.clone());
-            return Ok(PendingCheckpoint::new(move || {
-                Ok(Checkpoint { method: METHOD.to_owned(), seconds: 0.0, state, arrays })
-            }));
+            return Ok(PendingCheckpoint::new(move || Ok(Checkpoint::new(METHOD, state, arrays))));
         }
         let state = written(&state)?;
         let reads = self.field.as_ref().map_or(Vec::new(), |(_, learner)| begin_read(&gpu, learner.learned()));
-        Ok(PendingCheckpoint::new(move || {
-            Ok(Checkpoint { method: METHOD.to_owned(), seconds: 0.0, state, arrays: finish(&gpu, reads)? })
-        }))
+        Ok(PendingCheckpoint::new(move || Ok(Checkpoint::new(METHOD, state, finish(&gpu, reads)?))))
     }
 
     /// The model that a checkpoint holds with some of its buffers, without keyframes.
@@ -223,7 +219,7 @@ impl NerfModel {
         let reads = self.field.as_ref().map_or(Vec::new(), |(_, learner)| begin_read(&self.gpu, learner.drawn()));
         let (state, arrays) = (written(&self.state()?)?, finish(&self.gpu, reads)?);
         let cameras = self.camera_fixes()?.clone();
-        Checkpoint { method: METHOD.to_owned(), seconds: 0.0, state, arrays }.write(&folder.join(FIELD))?;
+        Checkpoint::new(METHOD, state, arrays).write(&folder.join(FIELD))?;
         let sizes = self.field.as_ref().map(|(_, learner)| &learner.sizes);
         let about = serde_json::json!({
             "method": METHOD,

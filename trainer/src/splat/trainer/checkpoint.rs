@@ -116,7 +116,7 @@ impl SplatTrainer {
             arrays.push(Array { name: SEED_CELLS.to_owned(), bytes: cells });
             let terms: Vec<u8> = terms.map_or(Ok(Vec::new()), |read| read.finish(&gpu))?;
             arrays.push(Array { name: CAMERA_TERMS.to_owned(), bytes: terms });
-            Ok(Checkpoint { method: METHOD.to_owned(), seconds: 0.0, state, arrays })
+            Ok(Checkpoint::new(METHOD, state, arrays))
         }))
     }
 

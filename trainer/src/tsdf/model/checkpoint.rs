@@ -34,7 +34,7 @@ pub(super) struct State {
 impl TsdfModel {
     pub(super) fn take_checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         let (state, arrays) = self.state()?;
-        Ok(PendingCheckpoint::new(move || Ok(Checkpoint { method: METHOD.to_owned(), seconds: 0.0, state, arrays })))
+        Ok(PendingCheckpoint::new(move || Ok(Checkpoint::new(METHOD, state, arrays))))
     }
 
     /// The state and the blocks, in order of their places.

@@ -49,7 +49,7 @@ impl TsdfModel {
         let (state, arrays) = self.state()?;
         let arrays = arrays.into_iter().map(deflated).collect::<std::io::Result<Vec<Array>>>();
         let arrays = arrays.map_err(|source| refused(&blocks, source))?;
-        Checkpoint { method: METHOD.to_owned(), seconds: 0.0, state, arrays }.write(&blocks)?;
+        Checkpoint::new(METHOD, state, arrays).write(&blocks)?;
         let about = serde_json::json!({
             "method": METHOD,
             "steps": self.step,

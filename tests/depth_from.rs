@@ -1,0 +1,123 @@
+//! `fieldrig train --depth-from`: images without depth get that of a saved model.
+
+use image::{ImageBuffer, Luma, RgbImage};
+use serde_json::{Value, json};
+use std::path::Path;
+use std::process::{Command, Output};
+
+const N_PHOTOS: u32 = 10;
+const SIZE_PX: [u32; 2] = [48, 36];
+const N_STEPS: &str = "24";
+/// What depth is worth after these few steps, dB.
+const LEAST_GAIN_DB: f64 = 2.0;
+/// Measured 0.2 mm: splats keep the depth that they were seeded by.
+const MOST_DEPTH_ERROR_M: f64 = 2e-3;
+
+/// A nerfstudio folder: a camera slides along a colorful wall, 1 m away from it and `up_m` above where others look.
+fn scene(folder: &Path, has_depth: bool, up_m: f64) {
+    std::fs::create_dir(folder).expect("room on the disk");
+    let ([w, h], focal_px) = (SIZE_PX, 45.0);
+    let mut frames = Vec::new();
+    for ix in 0..N_PHOTOS {
+        let x_m = 0.05 * f64::from(ix);
+        let color = |u: u32, v: u32| {
+            let (x, y) = (x_m + (f64::from(u) - 23.5) / focal_px, (f64::from(v) - 17.5) / focal_px);
+            #[expect(clippy::cast_possible_truncation, reason = "27 to 227")]
+            let wave = |phase: f64| (127.0 + 100.0 * (8.0 * x + phase).sin() * (7.0 * y + phase).cos()) as u8;
+            image::Rgb([wave(0.0), wave(1.0), wave(2.0)])
+        };
+        let [photo, depth] = ["", "depth_"].map(|kind| format!("{kind}{ix:02}.png"));
+        RgbImage::from_fn(w, h, color).save(folder.join(&photo)).expect("room on the disk");
+        let rows = [[1.0, 0.0, 0.0, x_m], [0.0, 1.0, 0.0, up_m], [0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 0.0, 1.0]];
+        let mut frame = json!({ "file_path": photo, "transform_matrix": rows });
+        if has_depth {
+            let metre = ImageBuffer::<Luma<u16>, _>::from_pixel(w, h, Luma([1000]));
+            metre.save(folder.join(&depth)).expect("room on the disk");
+            frame["depth_file_path"] = depth.into();
+        }
+        frames.push(frame);
+    }
+    let lens = json!({ "fl_x": focal_px, "fl_y": focal_px, "cx": 24.0, "cy": 18.0, "w": w, "h": h, "frames": frames });
+    std::fs::write(folder.join("transforms.json"), lens.to_string()).expect("room on the disk");
+}
+
+fn fieldrig(folder: &Path, args: &[&str]) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
+    command.current_dir(folder).env_remove("FIELDRIG_LPIPS_WEIGHTS").args(args).output().expect("fieldrig starts")
+}
+
+fn train(folder: &Path, args: &[&str]) -> Output {
+    fieldrig(folder, &[&["train", "--json"], args].concat())
+}
+
+/// What a training that succeeded tells last.
+fn done(folder: &Path, args: &[&str]) -> Value {
+    let output = train(folder, args);
+    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    let told = String::from_utf8(output.stdout).expect("stdout is UTF-8");
+    serde_json::from_str(told.lines().last().expect("an end")).expect("a JSON object")
+}
+
+fn refused(folder: &Path, args: &[&str], code: i32, words: &str) {
+    let output = train(folder, &[args, &["--out", "x"]].concat());
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(code), "{args:?}: {told}");
+    assert!(told.lines().any(|line| line.starts_with("error: ") && line.contains(words)), "{args:?}: {told}");
+    assert!(!folder.join("x").exists(), "what is refused leaves nothing behind");
+}
+
+#[test]
+fn images_without_depth_are_learned_with_that_of_a_model_again_and_again_alike() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    scene(&folder.join("measured"), true, 0.0);
+    scene(&folder.join("seen"), false, 0.0);
+    scene(&folder.join("elsewhere"), false, 50.0);
+    done(folder, &["measured", "--method", "tsdf", "--refine", "none", "--out", "field"]);
+
+    let settings = ["--plan-steps", N_STEPS, "--seed", "3", "--max-splats", "2000", "--refine", "none"];
+    let splats = |data: &str, steps: &str, more: &[&str]| {
+        done(folder, &[&[data, "--steps", steps], &settings[..], more].concat())
+    };
+    let from_field = ["--depth-from", "field"];
+    let with = |more: &[&'static str]| [&from_field[..], more].concat();
+    let bare = splats("seen", N_STEPS, &["--out", "bare"]);
+    let drawn = splats("seen", N_STEPS, &with(&["--out", "drawn"]));
+    let psnr = |done: &Value| done["psnr"].as_f64().expect("a score");
+    assert!(psnr(&drawn) > psnr(&bare) + LEAST_GAIN_DB, "{bare} {drawn}");
+    let report = std::fs::read(folder.join("drawn/report.json")).expect("a report");
+    let report: Value = serde_json::from_slice(&report).expect("JSON");
+    assert_eq!(report["drawn_depth"]["n_images"], 8, "test images get none");
+    assert!(report["drawn_depth"]["drawn_frac"].as_f64() > Some(0.9), "{}", report["drawn_depth"]);
+
+    // What was measured stays as it is, and there is nothing else to draw here.
+    let measured = splats("measured", N_STEPS, &["--out", "measured splats"]);
+    let both = splats("measured", N_STEPS, &with(&["--out", "both"]));
+    assert_eq!(both["checkpoint_sha256"], measured["checkpoint_sha256"]);
+
+    let sum = &drawn["checkpoint_sha256"];
+    assert_eq!(splats("seen", N_STEPS, &with(&["--out", "twice"]))["checkpoint_sha256"], *sum);
+    splats("seen", "12", &with(&["--out", "half"]));
+    let resume = ["seen", "--resume", "half", "--steps", N_STEPS];
+    let whole = done(folder, &[&resume[..], &with(&["--out", "whole"])].concat());
+    assert_eq!(whole["checkpoint_sha256"], *sum, "two halves give another model");
+    let replay = ["seen", "--replay-decisions", "drawn/decisions.jsonl"];
+    let repeated = done(folder, &[&replay[..], &with(&["--out", "repeated"])].concat());
+    assert_eq!(repeated["checkpoint_sha256"], *sum, "the log gives another model");
+
+    for again in [&resume[..], &replay] {
+        refused(folder, again, 2, "name it with --depth-from");
+        refused(folder, &[again, &["--depth-from", "drawn"]].concat(), 2, "--depth-from names one with");
+    }
+    let bare = ["seen", "--resume", "bare", "--depth-from", "field"];
+    refused(folder, &bare, 2, "leave out --depth-from");
+    refused(folder, &["elsewhere", "--depth-from", "field"], 4, "no image sees anything of that model");
+    refused(folder, &["seen", "--depth-from", "measured"], 2, "measured holds no model");
+    refused(folder, &["seen", "--depth-from", "field/mesh.ply"], 1, "--depth-from field/mesh.ply: no model in");
+
+    // Depth from splats makes a mesh of images that have none.
+    done(folder, &["seen", "--method", "tsdf", "--depth-from", "drawn", "--out", "mesh"]);
+    let judged = fieldrig(folder, &["eval", "mesh", "measured", "--json"]).stdout;
+    let judged: Value = serde_json::from_slice(&judged).expect("a JSON object");
+    assert!(judged["depth_rmse_m"].as_f64().is_some_and(|error_m| error_m < MOST_DEPTH_ERROR_M), "{judged}");
+}
