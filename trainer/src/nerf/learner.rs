@@ -185,18 +185,21 @@ impl Learner {
         Ok(())
     }
 
-    /// Squared difference of color of each of some rays, as they are given, of images with these codes: nothing is learned. What was
-    /// sent must be done.
-    pub(crate) fn errors(
+    /// What each of some rays sees, as they are given, of images with these codes: nothing is learned. What was sent must be done.
+    pub(crate) fn look(
         &mut self,
         gpu: &Gpu,
         options: &NerfOptions,
         rays: &[Ray],
         codes: &[[f64; N_CODE]],
-    ) -> Result<Vec<f32>, Error> {
+    ) -> Result<Vec<Look>, Error> {
         self.write_slot(gpu, options, 0, 0, rays)?;
         let Self { compiled, field, samples, step: kept, occupancy, slots, passes: list, .. } = self;
-        let terms = &gpu.storage_with("nerf.terms_of_others", bytemuck::cast_slice(&terms_of(codes)))?;
+        let of_others = match codes {
+            [] => None,
+            codes => Some(gpu.storage_with("nerf.terms_of_others", bytemuck::cast_slice(&terms_of(codes)))?),
+        };
+        let terms = of_others.as_ref().unwrap_or(&field.no_terms);
         let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0], terms };
         passes.count(list, occupancy);
         passes.place(list, occupancy);
@@ -204,8 +207,18 @@ impl Learner {
         passes.composite(list, kept);
         list.submit(gpu);
         list.forget_bindings(); // These terms are used once.
-        let seen: Vec<[f32; 2]> = gpu.read(&kept.ray_errors, rays.len())?;
-        Ok(seen.into_iter().map(|[error, _]| error).collect())
+        let seen: Vec<[f32; 4]> = gpu.read(&kept.seen, rays.len())?;
+        let errors: Vec<[f32; 2]> = gpu.read(&kept.ray_errors, rays.len())?;
+        let background = background(options, 0);
+        let rgb = |[red, green, blue, left]: [f32; 4]| {
+            let over = |channel: usize, color: f32| f64::from(color + left * background[channel]);
+            [over(0, red), over(1, green), over(2, blue)]
+        };
+        Ok(seen
+            .into_iter()
+            .zip(errors)
+            .map(|(seen, [error, _])| Look { error: error.into(), rgb: rgb(seen) })
+            .collect())
     }
 
     /// Makes room for what is learned about so many images, which stays as it is known, and says what of it is learned from here on.
@@ -301,10 +314,9 @@ impl Learner {
             0,
             bytemuck::bytes_of(&March { most_samples: share.max(1), ..march_of(self.sizes.effort) }),
         );
-        // Whatever is behind the scene must not help to explain it.
-        let channel = |ix: u64| f32_of(unit(mixed(options.seed ^ mixed(step << 2 | ix))));
+        let [red, green, blue] = background(options, step);
         let loss = RayLoss {
-            background_srgb: [channel(0), channel(1), channel(2), 0.0],
+            background_srgb: [red, green, blue, 0.0],
             distance_weight: f32_of(options.distance_weight),
             distance_clip: DISTANCE_CLIP,
             distortion: f32_of(options.distortion),
@@ -451,6 +463,20 @@ impl Learner {
         }
         Ok(())
     }
+}
+
+/// What a ray sees.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Look {
+    /// Mean squared difference of color.
+    pub(crate) error: f64,
+    /// Over the background.
+    pub(crate) rgb: [f64; 3],
+}
+
+/// Whatever is behind the scene must not help to explain it.
+fn background(options: &NerfOptions, step: u64) -> [f32; 3] {
+    [0, 1, 2].map(|ix| f32_of(unit(mixed(options.seed ^ mixed(step << 2 | ix)))))
 }
 
 /// All that is kept of the first images.

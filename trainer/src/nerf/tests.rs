@@ -314,6 +314,7 @@ fn light_that_changes_is_found() {
     let mut unchanged = started(options(CameraChoice::Try(vec![GAINS])), &even);
     learn(&mut unchanged, 100);
     assert!(!unchanged.report()[0].kept, "{:?}", unchanged.report());
+    assert_eq!(unchanged.n_taken().unwrap(), 100, "where the light stays nothing is taken back");
     let mut model = started(options(CameraChoice::Try(vec![GAINS])), &changing);
     learn(&mut model, 75); // In the midst of the trial.
     let checkpoint = state(&mut model);

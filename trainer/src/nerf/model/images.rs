@@ -1,13 +1,14 @@
 //! What is learned about images with the field: their poses and their codes (light and exposure), whether that pays, and what it says
 //! about images that were not learned from.
 //!
-//! From a fixed step on one after the other is tried: the field goes on for some steps with it, is put back, and goes on for as many
-//! without. It stays where it foretells images that were held back until then, each from what is known of those before and after it in
-//! time.
+//! From a fixed step on one after the other is tried, unless it is plain that it brings nothing: the field goes on for some steps with it,
+//! is put back, and goes on for as many without. It stays where it foretells images that were held back until then, each from what is
+//! known of those before and after it in time.
 
 use super::NerfModel;
 use crate::checkpoint::Array;
 use crate::nerf::extent::Extent;
+use crate::nerf::learner::Look;
 use crate::nerf::params::{CODE, TERM_STRIDE};
 use crate::nerf::rays::{self, Draw, RayImage};
 use crate::splat::{CameraChoice, CameraFix, N_CODE, TermSet, between, drift_share};
@@ -117,14 +118,12 @@ impl NerfModel {
 
     /// The step at which trials have something to do.
     fn due_at(&self) -> Option<u64> {
-        let begin = (self.options.n_planned_steps / TRIAL_AT_SHARE).max(1);
-        let length = (self.options.n_planned_steps / TRIAL_SHARE).max(1);
-        let begin = begin + self.trials.ended.len() as u64 * length;
-        match (self.trials.are_over(), &self.trials.phase) {
-            (true, _) => None,
-            (false, Phase::Waiting) => Some(begin),
-            (false, Phase::With { .. } | Phase::Without { .. }) => Some(begin + length),
-        }
+        let share = |of: u64| (self.options.n_planned_steps / of).max(1);
+        let at = match &self.trials.phase {
+            Phase::Waiting => share(TRIAL_AT_SHARE),
+            Phase::With { before } | Phase::Without { before, .. } => before.step + share(TRIAL_SHARE),
+        };
+        (!self.trials.are_over()).then_some(at)
     }
 
     /// Steps until trials have something to do.
@@ -148,11 +147,14 @@ impl NerfModel {
                 log::info!("{candidate}: {} images held back are too few to judge by", self.held_back.len());
                 self.end_trials();
             }
-            Phase::Waiting => {
-                let before = self.saved()?;
-                self.learned = self.learned.and(candidate);
-                self.trials.phase = Phase::With { before };
-            }
+            Phase::Waiting => match self.speaks_against(candidate)? {
+                Some(part) => self.end_trial(part),
+                None => {
+                    let before = self.saved()?;
+                    self.learned = self.learned.and(candidate);
+                    self.trials.phase = Phase::With { before };
+                }
+            },
             Phase::With { before } => {
                 let errors_with = self.judge()?;
                 let with = self.saved()?;
@@ -163,26 +165,30 @@ impl NerfModel {
             Phase::Without { before, with, errors_with } => {
                 let errors_without = self.judge()?;
                 let part = bought(candidate, &errors_with, &errors_without);
-                log::info!(
-                    "{}: {:+.2} dB on {} held-back images (standard error {:.2}): {}",
-                    part.part,
-                    part.bought_db,
-                    part.n_images,
-                    part.standard_error_db,
-                    if part.kept { "learned from here on" } else { "does not pay" },
-                );
                 if part.kept {
                     self.n_taken_back += self.step - before.step;
                     self.put_back(&with)?;
                 }
-                self.trials.ended.push(part);
-                self.trials.left.pop_front();
-                if self.trials.are_over() {
-                    self.end_trials();
-                }
+                self.end_trial(part);
             }
         }
         Ok(())
+    }
+
+    fn end_trial(&mut self, part: Part) {
+        log::info!(
+            "{}: {:+.2} dB on {} held-back images (standard error {:.2}): {}",
+            part.part,
+            part.bought_db,
+            part.n_images,
+            part.standard_error_db,
+            if part.kept { "learned from here on" } else { "does not pay" },
+        );
+        self.trials.ended.push(part);
+        self.trials.left.pop_front();
+        if self.trials.are_over() {
+            self.end_trials();
+        }
     }
 
     /// A field that begins anew in the midst of a trial, or loses an image, has nothing to compare with what was saved.
@@ -204,6 +210,40 @@ impl NerfModel {
         self.is_extent_due = true;
     }
 
+    /// What a candidate would buy, where that can be told without learning it and is nothing: other light, where pictures multiplied by
+    /// what the images before and after them ask for come no nearer to images held back.
+    fn speaks_against(&mut self, candidate: TermSet) -> Result<Option<Part>, Error> {
+        if !candidate.image_gains {
+            return Ok(None);
+        }
+        let (learned_from, held_back) = (self.images.clone(), self.held_back.clone());
+        let own = self.compare(&learned_from, &[])?;
+        let log_gains: Vec<f64> = own.iter().map(Comparison::log_gain).collect();
+        // What all images ask for is the brightness of the field.
+        let mean = log_gains.iter().sum::<f64>() / log_gains.len().max(1) as f64;
+        let mut known: BTreeMap<&str, BTreeMap<i64, [f64; 1]>> = BTreeMap::new();
+        for (image, log_gain) in learned_from.iter().zip(log_gains) {
+            let of_camera = known.entry(&image.keyframe.camera).or_default();
+            of_camera.insert(image.keyframe.stamp.0, [log_gain - mean]);
+        }
+        let foretold = |image: &RayImage| between(known.get(image.keyframe.camera.as_ref())?, image.keyframe.stamp);
+        let compared = self.compare(&held_back, &[])?;
+        let with = held_back.iter().zip(&compared).map(|(image, own)| {
+            let [log_gain] = foretold(image).unwrap_or_default();
+            own.error_with(log_gain.exp())
+        });
+        let without = compared.iter().map(|own| own.error_with(1.0));
+        let part = bought(candidate, &with.collect::<Vec<_>>(), &without.collect::<Vec<_>>());
+        log::info!(
+            "{}: multiplying pictures would bring {:+.2} dB on {} held-back images (standard error {:.2})",
+            part.part,
+            part.bought_db,
+            part.n_images,
+            part.standard_error_db
+        );
+        Ok((!part.kept).then_some(part))
+    }
+
     /// Mean squared error of color of each image held back, from where and in what light those before and after it say it was taken.
     fn judge(&mut self) -> Result<Vec<f64>, Error> {
         let fixes = self.learned_fixes()?;
@@ -215,21 +255,26 @@ impl NerfModel {
         let code = |image: &RayImage| between(&fix_of(image)?.codes, image.keyframe.stamp);
         let images: Vec<RayImage> = self.held_back.iter().map(moved).collect();
         let codes: Vec<_> = self.held_back.iter().map(|image| code(image).unwrap_or_default()).collect();
-        let Some((extent, learner)) = &mut self.field else { return Ok(Vec::new()) };
-        let mut sums = vec![(0.0, 0.0); images.len()];
+        let compared = self.compare(&images, &codes)?;
+        Ok(compared.iter().map(|own| own.error / f64::max(own.n_rays, 1.0)).collect())
+    }
+
+    /// What the field shows of images with these codes (none where there are none), beside what they show.
+    fn compare(&mut self, images: &[RayImage], codes: &[[f64; N_CODE]]) -> Result<Vec<Comparison>, Error> {
+        let mut sums = vec![Comparison::default(); images.len()];
+        let Some((extent, learner)) = &mut self.field else { return Ok(sums) };
         for batch in 0..JUDGING_BATCHES {
             let n_rays = learner.sizes.effort.n_rays;
             let draw = Draw { seed: JUDGING_SEED, step: batch, n_rays, begin: super::BEGIN };
-            let rays = rays::draw(&images, extent, &draw);
-            for (ray, error) in rays.iter().zip(learner.errors(&self.gpu, &self.options, &rays, &codes)?) {
-                let is_seen = ray.target_rgb >> 24 > 0;
-                if is_seen && error.is_finite() {
-                    let sum = &mut sums[ray.code as usize];
-                    *sum = (sum.0 + f64::from(error), sum.1 + 1.0);
+            let rays = rays::draw(images, extent, &draw);
+            for (ray, look) in rays.iter().zip(learner.look(&self.gpu, &self.options, &rays, codes)?) {
+                let [rgb @ .., alpha] = ray.target_rgb.to_le_bytes();
+                if alpha > 0 && look.error.is_finite() {
+                    sums[ray.code as usize].add(&look, rgb.map(|value| f64::from(value) / 255.0));
                 }
             }
         }
-        Ok(sums.into_iter().map(|(sum, n)| sum / f64::max(n, 1.0)).collect())
+        Ok(sums)
     }
 
     /// What was learned about each camera; empty where nothing is. What was sent must be done.
@@ -292,6 +337,39 @@ fn drift_of(keyframe: &Keyframe, [a, b, c, x, y, z, ..]: &[f64; TERM_STRIDE], ex
     let drift = found.inverse() * given;
     let (turn_rad, shift_m) = (drift.rotation.scaled_axis(), drift.translation.vector);
     [turn_rad.x, turn_rad.y, turn_rad.z, shift_m.x, shift_m.y, shift_m.z]
+}
+
+/// Sums over the rays of an image, and over colors where pictures (seen) and images (shown) are multiplied.
+#[derive(Clone, Copy, Debug, Default)]
+struct Comparison {
+    error: f64,
+    n_rays: f64,
+    seen_seen: f64,
+    seen_shown: f64,
+    shown_shown: f64,
+}
+
+impl Comparison {
+    fn add(&mut self, look: &Look, shown: [f64; 3]) {
+        self.error += look.error;
+        self.n_rays += 1.0;
+        for (seen, shown) in look.rgb.into_iter().zip(shown) {
+            self.seen_seen += seen * seen;
+            self.seen_shown += seen * shown;
+            self.shown_shown += shown * shown;
+        }
+    }
+
+    /// Logarithm of the gain that brings the picture nearest to the image.
+    fn log_gain(&self) -> f64 {
+        let gain = self.seen_shown / self.seen_seen;
+        if gain > 0.0 && gain.is_finite() { gain.ln() } else { 0.0 }
+    }
+
+    /// Sum of squared differences where the picture is multiplied.
+    fn error_with(&self, gain: f64) -> f64 {
+        gain * gain * self.seen_seen - 2.0 * gain * self.seen_shown + self.shown_shown
+    }
 }
 
 /// What something learned of images bought, from the mean squared errors of the same images with and without.
