@@ -111,19 +111,20 @@ impl NerfModel {
         self.options.effort.unwrap_or(if self.gpu.is_software() { Effort::SMALL } else { Effort::FULL })
     }
 
-    /// Makes a field where there is none, or where the scene has outgrown it. False where there is nothing to learn from.
+    /// Makes a field where there is none, or where the scene has outgrown it, with cells as fine as are due. False where there is nothing
+    /// to learn from.
     fn begin(&mut self) -> Result<bool, Error> {
         if self.images.is_empty() {
             return Ok(false);
         }
-        if !std::mem::take(&mut self.is_extent_due) && self.field.is_some() {
-            return Ok(true);
+        if std::mem::take(&mut self.is_extent_due) || self.field.is_none() {
+            self.images.par_iter().for_each(|image| {
+                image.depth_m();
+            });
+            self.fit_extent()?;
+            self.hint()?;
         }
-        self.images.par_iter().for_each(|image| {
-            image.depth_m();
-        });
-        self.fit_extent()?;
-        self.hint()?;
+        self.refine_when_due()?;
         Ok(true)
     }
 
@@ -287,8 +288,8 @@ impl Method for NerfModel {
             self.settle()?;
             return Ok(0);
         }
-        self.refine_when_due()?;
         self.try_when_due()?;
+        self.begin()?; // Images that were held back have joined, before the next step and not after so many as fit into a submit.
         let most = self.steps_to_finer_cells().min(self.steps_to_trial());
         let n_steps = n.min(self.steps_per_submit()).min(most);
         let since = Instant::now();
