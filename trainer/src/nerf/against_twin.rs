@@ -242,8 +242,7 @@ fn slopes_towards_images_match_the_twin() {
         .collect();
     let largest =
         [0, 1, 2].map(|part| expected.iter().flat_map(|ray| ray[part]).fold(0.0f64, |most, v| most.max(v.abs())));
-    for (options, learned) in forms().into_iter().flat_map(|options| [(options.clone(), ALL), (options, 0b1_1100_0000)])
-    {
+    for (options, learned) in forms().into_iter().flat_map(|options| [(options, ALL), (options, 0b1_1100_0000)]) {
         let bench = bench(&options, &twin, &rays, &vec![1.0; twin.shape.n_cells.len()]);
         let Bench { gpu, pipelines, widths, field, samples: batch, step, slopes, slot, terms } = &bench;
         let passes = FieldPasses { gpu, pipelines, field, samples: batch, slot, terms };
