@@ -219,6 +219,7 @@ fn request(keyframe: &Keyframe, lens: &PosedLens) -> RenderRequest {
         far_m: FAR_M,
         crop: None,
         background_srgb: [0.0; 3],
+        light_of: Some((keyframe.camera.clone(), keyframe.stamp)),
     }
 }
 

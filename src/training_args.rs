@@ -118,13 +118,14 @@ impl TrainingArgs {
     /// Refuses terms that were asked for and that no scene model learns: those that come along with the scene.
     pub(crate) fn check_learned(&self, kinds: &[Kind], evidence: Evidence) -> Result<(), BadArgument> {
         let can_align = |term: &Refine| evidence.depth && *term != Refine::ImageGains;
-        let can_learn = |term: &Refine| kinds.contains(&Kind::Nerf) && *term == Refine::ImagePoses;
+        let can_learn =
+            |term: &Refine| kinds.contains(&Kind::Nerf) && matches!(term, Refine::ImagePoses | Refine::ImageGains);
         let is_other = |term: &Refine| matches!(term, Refine::Auto | Refine::None | Refine::Base);
         let is_left = |term: &Refine| is_other(term) || can_align(term) || can_learn(term);
         if kinds.contains(&Kind::Splat) || self.refine.iter().all(is_left) {
             return Ok(());
         }
-        let along = if kinds.contains(&Kind::Nerf) { ", learns image-poses along" } else { "" };
+        let along = if kinds.contains(&Kind::Nerf) { ", learns image-poses and image-gains along" } else { "" };
         Err(BadArgument(format!(
             "--refine: the method {} corrects cameras by laying images with depth over each other at the start{along}, and no others",
             method::in_words(kinds)
@@ -267,6 +268,7 @@ mod tests {
         let told = args.check_for(&[Kind::Tsdf, Kind::Nerf]).unwrap_err().0;
         assert!(told.contains("--max-splats") && told.contains("tsdf and nerf"), "{told}");
         assert!(args.check_learned(&[Kind::Tsdf], evidence).is_err());
+        assert!(args.check_learned(&[Kind::Nerf], evidence).is_ok());
     }
 
     #[test]

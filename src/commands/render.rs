@@ -148,6 +148,7 @@ impl Args {
                 max_m: [to_x, to_y, to_z],
             }),
             background_srgb: [0.0; 3],
+            light_of: None,
         })
     }
 }

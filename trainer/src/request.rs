@@ -1,6 +1,7 @@
 //! Requests for pictures of the model, and the pictures.
 
-use kinematics::{Transform, Twist};
+use kinematics::{Stamp, Transform, Twist};
+use std::sync::Arc;
 
 /// A box with sides along the axes of the frame it is given in, metres.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -55,6 +56,9 @@ pub struct RenderRequest {
     pub crop: Option<Aabb>,
     /// Colour behind everything, sRGB 0 to 1.
     pub background_srgb: [f32; 3],
+    /// In the light and with the exposure that this camera had at this time, where the model knows them; `None`: in those of the
+    /// mean image.
+    pub light_of: Option<(Arc<str>, Stamp)>,
 }
 
 /// A drawn picture.

@@ -187,5 +187,6 @@ pub(crate) fn request(world_from_camera: Transform) -> RenderRequest {
         far_m: 100.0,
         crop: None,
         background_srgb: [0.0, 0.5, 1.0],
+        light_of: None,
     }
 }

@@ -96,6 +96,7 @@ fn tell_news(hub: &Hub) {
         far_m: 50.0,
         crop: None,
         background_srgb: [0.1; 3],
+        light_of: None,
     };
     hub.set_live_image(LiveImage {
         camera: Arc::clone(&live.camera),

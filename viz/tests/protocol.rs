@@ -170,6 +170,7 @@ fn request_of_stage(message: &Value, header: &Value) -> trainer::RenderRequest {
         far_m: header["far_m"].as_f64().expect("far"),
         crop: None,
         background_srgb: [0.0; 3],
+        light_of: None,
     }
 }
 

@@ -1,8 +1,8 @@
 //! The kernels against their twins in f64.
 
-use super::buffers::{FieldBuffers, FieldMoments, FieldSlopes, PoseBuffers, RaySlot, SampleBuffers, StepBuffers};
+use super::buffers::{FieldBuffers, FieldMoments, FieldSlopes, RaySlot, SampleBuffers, StepBuffers, TermBuffers};
 use super::kernels::{FieldPipelines, KERNELS, N_CHUNK, Widths};
-use super::params::{self, Batch, LearnRule, Level, PoseRule, RayLoss, Span};
+use super::params::{self, Batch, LearnRule, Level, RayLoss, Span, TermRule};
 use super::passes::FieldPasses;
 use super::reference::field::{Field, FieldGrad};
 use super::reference::network::Network;
@@ -10,7 +10,7 @@ use super::reference::pose::ImagePose;
 use super::reference::ray as reference;
 use super::reference::scene::{N_CODE, Ray, WEIGHTS, field, gradient, ray, samples};
 use super::reference::space::contract;
-use crate::gpu::{Gpu, GpuOptions, Passes, f32_of, f32s_of, reflect, resolve};
+use crate::gpu::{Buffer, Gpu, GpuOptions, Passes, f32_of, f32s_of, reflect, resolve};
 use crate::mismatches::Mismatches;
 use crate::optim::reference::{Adam, Moments};
 
@@ -88,6 +88,8 @@ struct Bench {
     step: StepBuffers,
     slopes: FieldSlopes,
     slot: RaySlot,
+    /// A code a ray.
+    terms: Buffer,
 }
 
 fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Bench {
@@ -95,7 +97,7 @@ fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Be
     let widths = Widths::new(u32::try_from(twin.shape.n_cells.len()).unwrap(), 7, u32::try_from(N_CODE).unwrap());
     let n_samples = u32::try_from(rays.iter().map(|ray| ray.spans.len()).sum::<usize>()).unwrap();
     let n_rays = u32::try_from(rays.len()).unwrap();
-    let field = FieldBuffers::new(&gpu, &twin.shape, &widths, n_rays).unwrap();
+    let field = FieldBuffers::new(&gpu, &twin.shape, &widths).unwrap();
     let entries: Vec<[f32; 2]> = twin.table.iter().map(|entry| f32s_of(*entry)).collect();
     gpu.write(&field.grid, 0, bytemuck::cast_slice(&entries));
     gpu.write(&field.weights, 0, bytemuck::cast_slice(&weights(twin, &widths)));
@@ -103,7 +105,7 @@ fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Be
     let samples = SampleBuffers::new(&gpu, n_samples + 600).unwrap();
     let step = StepBuffers::new(&gpu, &widths, n_rays + 3, n_samples + 600).unwrap();
     gpu.write(&samples.batch, 0, bytemuck::bytes_of(&Batch { n_samples, ..Batch::of(n_rays) }));
-    let (mut gpu_rays, mut spans, mut points, mut codes) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let (mut gpu_rays, mut spans, mut points) = (Vec::new(), Vec::new(), Vec::new());
     for (ray, code) in rays.iter().zip(0..) {
         let byte = |value: f64| u32::from(format!("{:.0}", 255.0 * value).parse::<u8>().unwrap());
         let [red, green, blue] = ray.target.rgb.map(byte);
@@ -125,13 +127,13 @@ fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Be
             [x, y, z, 0.0]
         };
         points.extend(ray.spans.iter().flat_map(point));
-        codes.extend(ray.code.iter().map(|value| f32_of(*value)));
     }
     let slot = RaySlot::new(&gpu, n_rays + 3).unwrap();
     gpu.write(&slot.rays, 0, bytemuck::cast_slice(&gpu_rays));
     gpu.write(&samples.points, 0, bytemuck::cast_slice(&points));
     gpu.write(&samples.spans, 0, bytemuck::cast_slice(&spans));
-    gpu.write(&field.codes, 0, bytemuck::cast_slice(&codes));
+    let codes: Vec<[f64; N_CODE]> = rays.iter().map(|ray| ray.code.clone().try_into().unwrap()).collect();
+    let terms = gpu.storage_with("terms", bytemuck::cast_slice(&params::terms_of(&codes))).unwrap();
     let slopes = FieldSlopes::new(&gpu, &twin.shape).unwrap();
     gpu.write(&slopes.scales, 0, bytemuck::cast_slice(scales));
     let loss = RayLoss {
@@ -155,6 +157,7 @@ fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Be
         step,
         slopes,
         slot,
+        terms,
     }
 }
 
@@ -188,8 +191,8 @@ fn pictures_and_gradients_match_the_twin() {
     let scale = f32_of((2f64.powi(28) / largest).log2().floor().exp2());
     for options in forms() {
         let bench = bench(&options, &twin, &rays, &vec![scale; twin.shape.n_cells.len()]);
-        let Bench { gpu, pipelines, widths, field, samples: batch, step, slopes, slot } = &bench;
-        let passes = FieldPasses { gpu, pipelines, field, samples: batch, slot };
+        let Bench { gpu, pipelines, widths, field, samples: batch, step, slopes, slot, terms } = &bench;
+        let passes = FieldPasses { gpu, pipelines, field, samples: batch, slot, terms };
         let mut list = Passes::default();
         passes.forward(&mut list, step);
         passes.backward(&mut list, step, slopes);
@@ -220,16 +223,29 @@ fn pictures_and_gradients_match_the_twin() {
     }
 }
 
-/// Slopes towards the poses of images, and the first step of each: images of seven rays, the last of fewer.
+/// Slopes towards poses and codes of images, and the first step of each: images of seven rays, the last of fewer.
 #[test]
-fn slopes_towards_poses_match_the_twin() {
+fn slopes_towards_images_match_the_twin() {
     const RAYS_PER_IMAGE: usize = 7;
     const N_IMAGES: usize = (N_RAYS as usize).div_ceil(RAYS_PER_IMAGE);
+    const ALL: u32 = (1 << params::TERM_STRIDE) - 1;
+    const RATES: [f64; 3] = [0.25, 0.125, 0.0625];
     let (twin, rays) = (field(7), rays());
-    for options in forms() {
+    // Turn, shift and code of each ray.
+    let expected: Vec<[[f64; 3]; 3]> = rays
+        .iter()
+        .map(|ray| {
+            let (_, places, code) = gradient(&twin, ray);
+            let ImagePose { turn_rad, shift } = ImagePose::slopes(ray.direction, &places);
+            [turn_rad, shift, code.try_into().unwrap()].map(|part| part.map(|v| v / f64::from(N_RAYS)))
+        })
+        .collect();
+    let largest =
+        [0, 1, 2].map(|part| expected.iter().flat_map(|ray| ray[part]).fold(0.0f64, |most, v| most.max(v.abs())));
+    for (options, learned) in forms().into_iter().flat_map(|options| [(options, ALL), (options, 0b1_1100_0000)]) {
         let bench = bench(&options, &twin, &rays, &vec![1.0; twin.shape.n_cells.len()]);
-        let Bench { gpu, pipelines, widths, field, samples: batch, step, slopes, slot } = &bench;
-        let passes = FieldPasses { gpu, pipelines, field, samples: batch, slot };
+        let Bench { gpu, pipelines, widths, field, samples: batch, step, slopes, slot, terms } = &bench;
+        let passes = FieldPasses { gpu, pipelines, field, samples: batch, slot, terms };
         let rule = LearnRule {
             rate: 1.0,
             final_rate_frac: 1.0,
@@ -241,8 +257,9 @@ fn slopes_towards_poses_match_the_twin() {
         };
         let moments = FieldMoments::new(gpu, &twin.shape, widths, &rule).unwrap();
         let n_images = u32::try_from(N_IMAGES + 1).unwrap(); // One has no rays.
-        let rule = PoseRule { turn_rate: 0.25, shift_rate: 0.125, pull: 0.5, n_images };
-        let poses = PoseBuffers::new(gpu, &rule, N_RAYS + 3, batch.n_samples).unwrap();
+        let [turn_rate, shift_rate, code_rate] = RATES.map(f32_of);
+        let rule = TermRule { learned, n_images, turn_rate, shift_rate, code_rate, pull: 0.5, unused: [0; 2] };
+        let images = TermBuffers::new(gpu, &rule, N_RAYS + 3, batch.n_samples).unwrap();
         let mut list = Passes::default();
         passes.forward(&mut list, step);
         passes.backward(&mut list, step, slopes);
@@ -252,41 +269,40 @@ fn slopes_towards_poses_match_the_twin() {
             ray.code = u32::try_from(ix / RAYS_PER_IMAGE).unwrap();
         }
         gpu.write(&slot.rays, 0, bytemuck::cast_slice(&of_images));
-        passes.learn_poses(&mut list, step, &moments, &poses);
+        passes.pose_slopes(&mut list, step, &images);
+        passes.code_slopes(&mut list, step, &images);
+        passes.learn_images(&mut list, &moments, &images);
         list.submit(gpu);
 
-        let expected: Vec<ImagePose> = rays
-            .iter()
-            .map(|ray| {
-                let (_, places, _) = gradient(&twin, ray);
-                let ImagePose { turn_rad, shift } = ImagePose::slopes(ray.direction, &places);
-                let mean = |v: f64| v / f64::from(N_RAYS);
-                ImagePose { turn_rad: turn_rad.map(mean), shift: shift.map(mean) }
-            })
-            .collect();
-        let parts = |pose: &ImagePose| [pose.turn_rad, pose.shift];
-        let largest = expected.iter().flat_map(parts).flatten().fold(0.0f64, |most, v| most.max(v.abs()));
         let mut wrong = Mismatches::default();
-        let got: Vec<[[f32; 4]; 2]> = gpu.read(&poses.v_rays, rays.len()).unwrap();
+        let got: Vec<[[f32; 4]; 2]> = gpu.read(&images.v_rays, rays.len()).unwrap();
+        let v_codes: Vec<[f32; 4]> = gpu.read(&images.v_codes, batch.n_samples as usize).unwrap();
         for (ix, (got, expected)) in got.iter().zip(&expected).enumerate() {
-            for (part, (got, expected)) in got.iter().zip(parts(expected)).enumerate() {
-                for axis in 0..3 {
+            let samples =
+                of_images[ix].first_sample as usize..(of_images[ix].first_sample + of_images[ix].n_samples) as usize;
+            let code = |axis: usize| v_codes[samples.clone()].iter().map(|v| v[axis]).sum::<f32>();
+            for axis in 0..3 {
+                for (part, got) in [got[0][axis], got[1][axis], code(axis)].into_iter().enumerate() {
                     let what = format!("ray {ix}, part {part}, axis {axis}");
-                    wrong.check(what, got[axis].into(), expected[axis], 2e-5 * largest, 2e-4);
+                    wrong.check(what, got.into(), expected[part][axis], 2e-5 * largest[part], 2e-4);
                 }
             }
         }
-        let terms: Vec<[params::Term; params::TERM_STRIDE]> = gpu.read(&poses.terms, N_IMAGES + 1).unwrap();
+        let terms: Vec<[params::Term; params::TERM_STRIDE]> = gpu.read(&images.terms, N_IMAGES + 1).unwrap();
         for (image, of_image) in expected.chunks(RAYS_PER_IMAGE).enumerate() {
-            for (term, got) in terms[image].iter().enumerate().take(params::TERMS) {
-                let sum: f64 = of_image.iter().map(|pose| parts(pose).as_flattened()[term]).sum();
+            for (term, got) in terms[image].iter().enumerate() {
+                if learned & (1 << term) == 0 {
+                    assert_eq!(*got, [0.0; 4], "image {image}: term {term} is not learned");
+                    continue;
+                }
+                let (part, axis) = (term / 3, term % 3);
+                let sum: f64 = of_image.iter().map(|ray| ray[part][axis]).sum();
                 let [value, first, second, n_steps] = got.map(f64::from);
                 let what = |name: &str| format!("image {image}, term {term}, {name}");
-                wrong.check(what("slope"), first / 0.1, sum, 5e-5 * largest, 2e-4);
+                wrong.check(what("slope"), first / 0.1, sum, 5e-5 * largest[part], 2e-4);
                 wrong.check(what("square"), second / 0.01, (first / 0.1).powi(2), 1e-12, 1e-4);
-                let rate = if term < 3 { 0.25 } else { 0.125 };
                 // A first step goes as far as the rate says, and half of it is pulled back.
-                wrong.check(what("value"), value, -0.5 * rate * first.signum(), 1e-6, 1e-5);
+                wrong.check(what("value"), value, -0.5 * RATES[part] * first.signum(), 1e-6, 1e-5);
                 wrong.check(what("steps"), n_steps, 1.0, 1e-9, 0.0);
             }
         }
@@ -294,7 +310,7 @@ fn slopes_towards_poses_match_the_twin() {
         assert_eq!(terms[N_IMAGES], [[0.0; 4]; params::TERM_STRIDE], "an image without rays stays where it is");
 
         gpu.write(&slot.rays, 0, bytemuck::cast_slice(&of_images));
-        passes.aim(&mut list, &poses);
+        FieldPasses { terms: &images.terms, ..passes }.aim(&mut list);
         list.submit(gpu);
         let aimed: Vec<params::Ray> = gpu.read(&slot.rays, rays.len()).unwrap();
         for (ix, (ray, got)) in rays.iter().zip(aimed).enumerate() {
@@ -328,10 +344,10 @@ fn steps_of_learning_match_the_twin() {
     let of_weights = LearnRule { rate: 0.01, pull: 0.5, ..of_grid };
     let first_scale = 2f32.powi(28); // Fine enough for the first step; the others find their own.
     let bench = bench(&GpuOptions::default(), &twin, &rays, &vec![first_scale; twin.shape.n_cells.len()]);
-    let Bench { gpu, pipelines, widths, field: buffers, samples, step: kept_step, slopes, slot } = &bench;
+    let Bench { gpu, pipelines, widths, field: buffers, samples, step: kept_step, slopes, slot, terms } = &bench;
     let moments = FieldMoments::new(gpu, &twin.shape, widths, &of_grid).unwrap();
     let rules = [gpu.uniform_with("rule", &of_grid), gpu.uniform_with("rule", &of_weights)];
-    let passes = FieldPasses { gpu, pipelines, field: buffers, samples, slot };
+    let passes = FieldPasses { gpu, pipelines, field: buffers, samples, slot, terms };
     let adam = Adam { beta1: 0.75, beta2: 0.875, epsilon: f64::from(of_grid.epsilon) };
     let mut kept_table = vec![[Moments::default(); 2]; twin.table.len()];
     let mut kept =
@@ -382,9 +398,9 @@ fn steps_of_learning_match_the_twin() {
 fn slopes_too_large_for_their_scale_are_counted_and_left_out() {
     let (twin, rays) = (field(7), rays());
     let bench = bench(&GpuOptions::default(), &twin, &rays, &vec![f32::MAX; twin.shape.n_cells.len()]);
-    let Bench { gpu, pipelines, field, samples, step, slopes, slot, .. } = &bench;
+    let Bench { gpu, pipelines, field, samples, step, slopes, slot, terms, .. } = &bench;
     let mut list = Passes::default();
-    let passes = FieldPasses { gpu, pipelines, field, samples, slot };
+    let passes = FieldPasses { gpu, pipelines, field, samples, slot, terms };
     passes.forward(&mut list, step);
     passes.backward(&mut list, step, slopes);
     list.submit(gpu);
@@ -409,7 +425,7 @@ fn every_kernel_parses_and_validates_and_structs_have_the_same_layout() {
                 Some("Level") => size_of::<Level>(),
                 Some("RayLoss") => size_of::<RayLoss>(),
                 Some("Pace") => size_of::<params::Pace>(),
-                Some("PoseRule") => size_of::<PoseRule>(),
+                Some("TermRule") => size_of::<TermRule>(),
                 Some("LearnRule") => size_of::<LearnRule>(),
                 _ => continue,
             };

@@ -11,6 +11,7 @@ use super::reference::grid::GridShape;
 use super::sizes::Sizes;
 use crate::Error;
 use crate::gpu::{Gpu, PassTiming, f32_of, f32s_of};
+use crate::splat::TermSet;
 use nalgebra::Vector3;
 use std::sync::Arc;
 use std::time::Instant;
@@ -45,13 +46,13 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
     let effort = Effort { n_rays, n_samples, ..Effort::FULL };
     let (n_levels, coarsest, finest, log2_entries) = GRID;
     let shape = GridShape::between(coarsest, finest, n_levels, log2_entries);
-    let sizes = Sizes { n_cells: shape.n_cells, log2_entries, n_codes: 1, has_depth: false, refines: false, effort };
+    let sizes = Sizes { n_cells: shape.n_cells, log2_entries, has_depth: false, refines: false, effort };
     let compiled = Arc::new(Compiled::new(gpu, &sizes.effort)?);
     let mut learner = Learner::new(gpu, &options, sizes, compiled)?;
     let rays = synthetic_rays(effort);
     let submit = |learner: &mut Learner, n_steps: usize| {
         for slot_ix in 0..n_steps {
-            learner.record_step(gpu, &options, slot_ix, STEP, &rays)?;
+            learner.record_step(gpu, &options, slot_ix, STEP, &rays, TermSet::NONE)?;
         }
         Ok(learner.submit(gpu))
     };
@@ -83,7 +84,8 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
         timed.sort_by(|(a, _), (b, _)| a.total_cmp(b));
         Ok(timed.swap_remove(timed.len() / 2))
     };
-    let (step_millis, passes) = timed(&mut learner, &|learner| learner.record_step(gpu, &options, 0, STEP, &rays))?;
+    let (step_millis, passes) =
+        timed(&mut learner, &|learner| learner.record_step(gpu, &options, 0, STEP, &rays, TermSet::NONE))?;
     let (colors_millis, _) = timed(&mut learner, &|learner| {
         learner.record_colors(gpu);
         Ok(())

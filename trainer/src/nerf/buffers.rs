@@ -1,7 +1,7 @@
 //! What the field and its samples take on the GPU.
 
 use super::kernels::{N_CHUNK, N_TILE, Widths};
-use super::params::{Batch, LearnRule, Level, March, PoseRule, Ray, RayLoss, TERM_STRIDE, Term, Visit, levels};
+use super::params::{Batch, LearnRule, Level, March, Ray, RayLoss, TERM_STRIDE, Term, TermRule, Visit, levels};
 use super::reference::grid::GridShape;
 use crate::Error;
 use crate::gpu::{Buffer, Gpu};
@@ -14,10 +14,10 @@ pub(crate) struct FieldBuffers {
     pub(crate) grid: Buffer,
     /// Of all layers of both networks, `[outputs, inputs]` each.
     pub(crate) weights: Buffer,
-    /// `[n_codes, n_code]`.
-    pub(crate) codes: Buffer,
     /// What kernels bind and do not use.
     pub(crate) nothing: Buffer,
+    /// Terms of no image.
+    pub(crate) no_terms: Buffer,
     pub(crate) n_entries: u32,
 }
 
@@ -143,42 +143,45 @@ pub(crate) struct StepBuffers {
     pub(crate) partial_sums: Buffer,
 }
 
-/// What is learned about the poses of images, and the slopes towards them.
+/// What is learned about images, and the slopes towards that.
 #[derive(Debug)]
-pub(crate) struct PoseBuffers {
+pub(crate) struct TermBuffers {
     /// `[n_images, TERM_STRIDE]`.
     pub(crate) terms: Buffer,
     pub(crate) rule: Buffer,
     pub(crate) n_images: u32,
-    /// Of each sample and of each ray.
+    /// Of the places of each sample, and of each ray.
     pub(crate) v_points: Buffer,
     pub(crate) v_rays: Buffer,
+    /// Of each sample.
+    pub(crate) v_codes: Buffer,
 }
 
-impl PoseBuffers {
-    /// Of images whose poses are right as far as anyone knows.
-    pub(crate) fn new(gpu: &Gpu, rule: &PoseRule, n_rays: u32, n_samples: u32) -> Result<Self, Error> {
+impl TermBuffers {
+    /// Of images that have right poses and the same light as far as anyone knows.
+    pub(crate) fn new(gpu: &Gpu, rule: &TermRule, n_rays: u32, n_samples: u32) -> Result<Self, Error> {
         let n_images = rule.n_images;
         Ok(Self {
             terms: gpu.storage("nerf.terms", u64::from(n_images) * (TERM_STRIDE * size_of::<Term>()) as u64)?,
-            rule: gpu.uniform_with("nerf.pose_rule", rule),
+            rule: gpu.uniform_with("nerf.term_rule", rule),
             n_images,
             v_points: gpu.storage("nerf.v_points", 16 * u64::from(n_samples))?,
             v_rays: gpu.storage("nerf.v_rays", 32 * u64::from(n_rays))?,
+            v_codes: gpu.storage("nerf.v_codes", 16 * u64::from(n_samples))?,
         })
     }
 }
 
 impl FieldBuffers {
     /// A field of zeros.
-    pub(crate) fn new(gpu: &Gpu, shape: &GridShape, widths: &Widths, n_codes: u32) -> Result<Self, Error> {
+    pub(crate) fn new(gpu: &Gpu, shape: &GridShape, widths: &Widths) -> Result<Self, Error> {
         let levels: Vec<Level> = levels(shape);
         Ok(Self {
             levels: gpu.storage_with("nerf.levels", bytemuck::cast_slice(&levels))?,
             grid: gpu.storage("nerf.grid", 8 * u64::from(shape.n_entries_in_all()))?,
             weights: gpu.storage("nerf.weights", 4 * u64::from(widths.n_weights()))?,
             nothing: gpu.storage("nerf.nothing", 16)?,
-            codes: gpu.storage("nerf.codes", 4 * u64::from(n_codes.max(1)) * u64::from(widths.n_code.max(1)))?,
+            no_terms: gpu.storage("nerf.no_terms", 16)?,
             n_entries: shape.n_entries_in_all(),
         })
     }

@@ -2,7 +2,7 @@
 //
 // threads   LANES per 32 samples
 // reads     batch, levels [n_levels], points [n_samples] (in the unit cube), grid [n_entries], weights, rays, spans,
-//           codes [n_images, N_CODE]
+//           terms [n_images, TERM_STRIDE] (of images past their end the code is zero)
 // writes    told [n_samples] (logarithm of the density); where COLORS: colors [n_samples];
 //           where KEEPS: held [n_tiles, n_held_rows, 8] (vec4 of four samples)
 // twin      nerf/reference/field.rs
@@ -13,6 +13,7 @@
 #import hash_grid
 #import network_tile
 #import sh
+#import image_terms
 
 @group(0) @binding(0) var<storage, read> batch: Batch;
 @group(0) @binding(1) var<storage, read> levels: array<Level>;
@@ -21,7 +22,7 @@
 @group(0) @binding(4) var<storage, read> weights: array<vec4f>;
 @group(0) @binding(5) var<storage, read> rays: array<Ray>;
 @group(0) @binding(6) var<storage, read> spans: array<Span>;
-@group(0) @binding(7) var<storage, read> codes: array<f32>;
+@group(0) @binding(7) var<storage, read> terms: array<vec4f>;
 @group(0) @binding(8) var<storage, read_write> told: array<f32>;
 @group(0) @binding(9) var<storage, read_write> colors: array<vec4f>;
 @group(0) @binding(10) var<storage, read_write> held: array<vec4f>;
@@ -126,6 +127,12 @@ fn work_out(layer: Layer, tile: u32, lane: u32) {
     workgroupBarrier(); // The rows are there before the next layer reads them, and this one has read what that overwrites.
 }
 
+fn code_of(image: u32, k: u32) -> f32 {
+    let at = image * TERM_STRIDE + CODE + k;
+    if at < arrayLength(&terms) { return terms[at].x; }
+    return 0.0;
+}
+
 // Direction, what is handed on, and the image's code, in the second bank.
 fn color_inputs(tile: u32, lane: u32) {
     for (var sample = lane; sample < TILE; sample += LANES) {
@@ -134,7 +141,7 @@ fn color_inputs(tile: u32, lane: u32) {
         put(0u, sample, SH_0);
         var sums = ShSums(sample);
         each_sh(&sums, ray.direction, 3u);
-        for (var k = 0u; k < N_CODE; k++) { put(N_HARMONICS + N_HANDED_ON + k, sample, codes[ray.code * N_CODE + k]); }
+        for (var k = 0u; k < N_CODE; k++) { put(N_HARMONICS + N_HANDED_ON + k, sample, code_of(ray.code, k)); }
         for (var row = N_HARMONICS + N_HANDED_ON + N_CODE; row < N_COLOR_IN; row++) { put(row, sample, 0.0); }
     }
     for (var item = lane; item < N_HANDED_ON * PARTS; item += LANES) {

@@ -32,6 +32,7 @@ const SHARED: &[Source] = &[
     shared!("random"),
     shared!("hash_grid"),
     shared!("image_terms"),
+    shared!("term_step"),
     shared!("network_tile"),
     shared!("ray_loss"),
     shared!("learn_rule"),
@@ -59,7 +60,8 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("aim_rays"),
     kernel!("point_slopes"),
     kernel!("ray_slopes"),
-    kernel!("learn_poses"),
+    kernel!("code_slopes"),
+    kernel!("learn_images"),
     kernel!("weight_slopes"),
     kernel!("learn_weights"),
     kernel!("learn_grid"),
@@ -141,7 +143,8 @@ pub(crate) struct FieldPipelines {
     pub(crate) aim_rays: Pipeline,
     pub(crate) point_slopes: Pipeline,
     pub(crate) ray_slopes: Pipeline,
-    pub(crate) learn_poses: Pipeline,
+    pub(crate) code_slopes: Pipeline,
+    pub(crate) learn_images: Pipeline,
     pub(crate) weight_slopes: Pipeline,
     pub(crate) learn_weights: Pipeline,
     pub(crate) learn_grid: Pipeline,
@@ -149,8 +152,8 @@ pub(crate) struct FieldPipelines {
 }
 
 impl FieldPipelines {
-    /// For so many samples at most; `no_image` is the code of pictures that are of no image.
-    pub(crate) fn new(gpu: &Gpu, widths: &Widths, n_samples: u32, no_image: u32) -> Result<Self, Error> {
+    /// For so many samples at most; `of_picture` is where the terms of a picture lie among those that it is drawn with.
+    pub(crate) fn new(gpu: &Gpu, widths: &Widths, n_samples: u32, of_picture: u32) -> Result<Self, Error> {
         let Widths { n_features, n_hidden, n_color_in, n_code } = *widths;
         let sizes = [
             ("N_FEATURES", f64::from(n_features)),
@@ -188,7 +191,7 @@ impl FieldPipelines {
             sum_cells: plain(kernel!("sum_cells"))?,
             mark_cells: plain(kernel!("mark_cells"))?,
             mark_blocks: plain(kernel!("mark_blocks"))?,
-            picture_rays: Pipeline::new(gpu, kernel!("picture_rays"), &[("NO_IMAGE", no_image.into())])?,
+            picture_rays: Pipeline::new(gpu, kernel!("picture_rays"), &[("OF_PICTURE", of_picture.into())])?,
             show_rays: plain(kernel!("show_rays"))?,
             densities: densities?,
             colors: colors?,
@@ -198,7 +201,8 @@ impl FieldPipelines {
             aim_rays: plain(kernel!("aim_rays"))?,
             point_slopes: Pipeline::new(gpu, kernel!("point_slopes"), &sizes)?,
             ray_slopes: plain(kernel!("ray_slopes"))?,
-            learn_poses: plain(kernel!("learn_poses"))?,
+            code_slopes: Pipeline::new(gpu, kernel!("code_slopes"), &with(&[("N_CODE", n_code.into())]))?,
+            learn_images: plain(kernel!("learn_images"))?,
             weight_slopes: weight_slopes?,
             learn_weights: Pipeline::new(gpu, kernel!("learn_weights"), &[("CHUNK", f64::from(N_CHUNK))])?,
             learn_grid: plain(kernel!("learn_grid"))?,

@@ -1,17 +1,19 @@
 //! A field on the GPU that learns from rays and draws pictures.
 
 use super::buffers::{
-    FieldBuffers, FieldMoments, FieldSlopes, Occupancy, PoseBuffers, RaySlot, SampleBuffers, StepBuffers,
+    FieldBuffers, FieldMoments, FieldSlopes, Occupancy, RaySlot, SampleBuffers, StepBuffers, TermBuffers,
 };
 use super::kernels::{FieldPipelines, Widths};
 use super::options::{Effort, NerfOptions};
-use super::params::{Backdrop, Batch, LearnRule, March, PoseRule, Ray, RayLoss, TERM_STRIDE, TERMS, Term, Visit};
+use super::params::{
+    Backdrop, Batch, CODE, LearnRule, March, Ray, RayLoss, TERM_STRIDE, Term, TermRule, Visit, terms_of,
+};
 use super::passes::{Canvas, FieldPasses};
 use super::rays::{mixed, unit};
 use super::reference::march as reference;
 use super::sizes::{LEAST_LEVELS, MOST_LEVELS, Sizes};
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
-use crate::splat::Camera;
+use crate::splat::{Camera, N_CODE, TermSet};
 use crate::{Error, Picture};
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -45,13 +47,15 @@ const SPREAD_NEAR: f32 = 0.05;
 /// a radius away, roughly.
 const TURN_RATE: f32 = 5e-4;
 const SHIFT_RATE: f32 = TURN_RATE / 3.0;
-/// Share of an image's turn and shift that is lost in a step at the start.
-const POSE_PULL: f32 = 5e-4;
+/// How far a number of an image's code goes in a step at the start.
+const CODE_RATE: f32 = 2e-2;
+/// Share of an image's turn, shift and code that is lost in a step at the start.
+const TERM_PULL: f32 = 5e-4;
 /// Scale of slopes at the start, before their sizes are known.
 const FIRST_SCALE: f32 = 1_048_576.0;
 
-/// Code of pictures that are of no image.
-const NO_IMAGE: u32 = 0;
+/// Where the terms of a picture lie, which is alone with them.
+const OF_PICTURE: u32 = 0;
 
 /// All that one field takes on the GPU.
 #[derive(Debug)]
@@ -61,8 +65,8 @@ pub(crate) struct Learner {
     pub(crate) moments: FieldMoments,
     pub(crate) slopes: FieldSlopes,
     pub(crate) occupancy: Occupancy,
-    /// Where the poses of images are learned.
-    pub(crate) poses: Option<PoseBuffers>,
+    /// Where anything is learned about images.
+    pub(crate) images: Option<TermBuffers>,
     compiled: Arc<Compiled>,
     samples: SampleBuffers,
     step: StepBuffers,
@@ -81,8 +85,8 @@ pub(crate) struct Compiled {
 
 impl Compiled {
     pub(crate) fn new(gpu: &Gpu, effort: &Effort) -> Result<Self, Error> {
-        let widths = Widths::new(effort.most_levels.clamp(LEAST_LEVELS, MOST_LEVELS), effort.n_hidden, 0);
-        Ok(Self { pipelines: FieldPipelines::new(gpu, &widths, effort.n_samples, NO_IMAGE)?, widths })
+        let widths = Widths::new(effort.most_levels.clamp(LEAST_LEVELS, MOST_LEVELS), effort.n_hidden, n_code());
+        Ok(Self { pipelines: FieldPipelines::new(gpu, &widths, effort.n_samples, OF_PICTURE)?, widths })
     }
 }
 
@@ -92,14 +96,14 @@ impl Learner {
         let Effort { n_rays, n_samples, .. } = sizes.effort;
         let shape = sizes.shape();
         let widths = compiled.widths.clone();
-        let field = FieldBuffers::new(gpu, &shape, &widths, sizes.n_codes)?;
+        let field = FieldBuffers::new(gpu, &shape, &widths)?;
         let slopes = FieldSlopes::new(gpu, &shape)?;
         gpu.write(&slopes.scales, 0, bytemuck::cast_slice(&vec![FIRST_SCALE; shape.n_cells.len()]));
         let learner = Self {
             compiled,
             moments: FieldMoments::new(gpu, &shape, &widths, &rule(options, 0.0))?,
             occupancy: Occupancy::new(gpu, &visit_of(&sizes.effort), sizes.has_depth)?,
-            poses: None,
+            images: None,
             samples: SampleBuffers::new(gpu, n_samples)?,
             step: StepBuffers::new(gpu, &widths, n_rays, n_samples)?,
             slots: Vec::new(),
@@ -141,7 +145,7 @@ impl Learner {
         grids.into_iter().chain([&field.weights, &moments.weights]).map(Buffer::bytes).sum()
     }
 
-    /// Lists one step that learns from some rays, as the `slot_ix`-th of a submit.
+    /// Lists one step that learns from some rays, as the `slot_ix`-th of a submit; `learned` of images where they are held.
     pub(crate) fn record_step(
         &mut self,
         gpu: &Gpu,
@@ -149,90 +153,145 @@ impl Learner {
         slot_ix: usize,
         step: u64,
         rays: &[Ray],
+        learned: TermSet,
     ) -> Result<(), Error> {
         self.write_slot(gpu, options, slot_ix, step, rays)?;
-        let Self { compiled, field, samples, step: kept, occupancy, moments, slopes, poses, passes: list, .. } = self;
-        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &self.slots[slot_ix] };
+        let Self { compiled, field, samples, step: kept, occupancy, moments, slopes, images, passes: list, .. } = self;
+        let terms = images.as_ref().map_or(&field.no_terms, |images| &images.terms);
+        let slot = &self.slots[slot_ix];
+        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, terms };
+        let images = images.as_ref().filter(|_| learned.any());
         let first_visit = if self.sizes.has_depth { FIRST_VISIT_WITH_DEPTH } else { VISIT_PERIOD };
         if step.is_multiple_of(VISIT_PERIOD) && step >= first_visit {
             passes.visit(list, occupancy, moments);
         }
-        if let Some(poses) = poses {
-            passes.aim(list, poses);
+        if images.is_some() && learned.image_poses {
+            passes.aim(list);
         }
         passes.count(list, occupancy);
         passes.place(list, occupancy);
         passes.forward(list, kept);
         passes.backward(list, kept, slopes);
-        if let Some(poses) = poses {
-            passes.learn_poses(list, kept, moments, poses);
+        if let Some(images) = images {
+            if learned.image_poses {
+                passes.pose_slopes(list, kept, images);
+            }
+            if learned.image_gains {
+                passes.code_slopes(list, kept, images);
+            }
+            passes.learn_images(list, moments, images);
         }
         passes.learn(list, [&self.rules[0], &self.rules[1]], kept, slopes, moments);
         Ok(())
     }
 
-    /// Squared difference of color of each of some rays, as they are given: nothing is learned. What was sent must be done.
-    pub(crate) fn errors(&mut self, gpu: &Gpu, options: &NerfOptions, rays: &[Ray]) -> Result<Vec<f32>, Error> {
+    /// What each of some rays sees, as they are given, of images with these codes: nothing is learned. What was sent must be done.
+    pub(crate) fn look(
+        &mut self,
+        gpu: &Gpu,
+        options: &NerfOptions,
+        rays: &[Ray],
+        codes: &[[f64; N_CODE]],
+    ) -> Result<Vec<Look>, Error> {
         self.write_slot(gpu, options, 0, 0, rays)?;
         let Self { compiled, field, samples, step: kept, occupancy, slots, passes: list, .. } = self;
-        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0] };
+        let of_others = match codes {
+            [] => None,
+            codes => Some(gpu.storage_with("nerf.terms_of_others", bytemuck::cast_slice(&terms_of(codes)))?),
+        };
+        let terms = of_others.as_ref().unwrap_or(&field.no_terms);
+        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0], terms };
         passes.count(list, occupancy);
         passes.place(list, occupancy);
         passes.forward(list, kept);
         passes.composite(list, kept);
         list.submit(gpu);
-        let seen: Vec<[f32; 2]> = gpu.read(&kept.ray_errors, rays.len())?;
-        Ok(seen.into_iter().map(|[error, _]| error).collect())
+        list.forget_bindings(); // These terms are used once.
+        let seen: Vec<[f32; 4]> = gpu.read(&kept.seen, rays.len())?;
+        let errors: Vec<[f32; 2]> = gpu.read(&kept.ray_errors, rays.len())?;
+        let background = background(options, 0);
+        let rgb = |[red, green, blue, left]: [f32; 4]| {
+            let over = |channel: usize, color: f32| f64::from(color + left * background[channel]);
+            [over(0, red), over(1, green), over(2, blue)]
+        };
+        Ok(seen
+            .into_iter()
+            .zip(errors)
+            .map(|(seen, [error, _])| Look { error: error.into(), rgb: rgb(seen) })
+            .collect())
     }
 
-    /// Lets the poses of so many images be learned from here on; those that are learned already stay.
-    pub(crate) fn hold_poses(&mut self, gpu: &Gpu, n_images: usize) -> Result<(), Error> {
+    /// Makes room for what is learned about so many images, which stays as it is known, and says what of it is learned from here on.
+    pub(crate) fn hold_images(&mut self, gpu: &Gpu, n_images: usize, learned: TermSet) -> Result<(), Error> {
         let n_images = u32::try_from(n_images).expect("few images");
-        if self.poses.as_ref().is_some_and(|poses| poses.n_images >= n_images) {
-            return Ok(());
-        }
-        let rule = PoseRule {
+        let n_held = self.images.as_ref().map_or(0, |images| images.n_images);
+        let rule = TermRule {
+            learned: bits_of(learned),
+            n_images: if n_held >= n_images { n_held } else { n_images.next_power_of_two() },
             turn_rate: TURN_RATE,
             shift_rate: SHIFT_RATE,
-            pull: POSE_PULL,
-            n_images: n_images.next_power_of_two(),
+            code_rate: CODE_RATE,
+            pull: TERM_PULL,
+            unused: [0; 2],
         };
+        if let Some(images) = self.images.as_ref().filter(|_| n_held >= n_images) {
+            gpu.write(&images.rule, 0, bytemuck::bytes_of(&rule));
+            return Ok(());
+        }
         self.passes.forget_bindings();
         let Effort { n_rays, n_samples, .. } = self.sizes.effort;
-        let poses = PoseBuffers::new(gpu, &rule, n_rays, n_samples)?;
-        if let Some(known) = self.poses.replace(poses)
-            && let Some(poses) = &self.poses
-        {
-            gpu.copy((&known.terms, 0), (&poses.terms, 0), known.terms.bytes());
+        let images = TermBuffers::new(gpu, &rule, n_rays, n_samples)?;
+        if let Some(known) = self.images.take() {
+            gpu.copy((&known.terms, 0), (&images.terms, 0), known.terms.bytes());
         }
+        self.images = Some(images);
         Ok(())
     }
 
-    /// Turn (rotation vector in world, radians) and shift (in world, units of the radius) of the first images; empty where poses are
-    /// not learned.
-    pub(crate) fn image_poses(&self, gpu: &Gpu, n_images: usize) -> Result<Vec<[f64; TERMS]>, Error> {
-        let Some(poses) = &self.poses else { return Ok(Vec::new()) };
-        let n = n_images.min(poses.n_images as usize);
-        let terms: Vec<[Term; TERM_STRIDE]> = gpu.read(&poses.terms, n)?;
-        let values = |image: &[Term; TERM_STRIDE]| std::array::from_fn(|ix| f64::from(image[ix][0]));
-        Ok(terms.iter().map(values).collect())
+    /// Lets images from the `first_ix`-th on begin with these codes, and with their poses as they are given.
+    pub(crate) fn begin_images(&self, gpu: &Gpu, first_ix: usize, codes: &[[f64; N_CODE]]) {
+        if let Some(images) = &self.images {
+            let row_bytes = TERM_STRIDE * size_of::<Term>();
+            gpu.write(&images.terms, (first_ix * row_bytes) as u64, bytemuck::cast_slice(&terms_of(codes)));
+        }
     }
 
-    /// Poses are right as they are given.
-    pub(crate) fn forget_poses(&mut self) {
+    /// Of each of the first images its turn (rotation vector in world, radians), its shift (in world, units of the radius) and its
+    /// code; empty where nothing is learned about images.
+    pub(crate) fn image_terms(&self, gpu: &Gpu, n_images: usize) -> Result<Vec<[f64; TERM_STRIDE]>, Error> {
+        let Some(images) = &self.images else { return Ok(Vec::new()) };
+        let terms = read_terms(gpu, images, n_images)?;
+        Ok(terms.iter().map(|image| image.map(|[value, ..]| f64::from(value))).collect())
+    }
+
+    /// Knows nothing about images.
+    pub(crate) fn forget_images(&mut self) {
         self.passes.forget_bindings();
-        self.poses = None;
+        self.images = None;
     }
 
-    /// Forgets the pose of an image; those after it move up.
-    pub(crate) fn forget_pose(&mut self, gpu: &Gpu, image_ix: usize) -> Result<(), Error> {
-        let Some(poses) = &self.poses else { return Ok(()) };
-        let mut terms: Vec<[Term; TERM_STRIDE]> = gpu.read(&poses.terms, poses.n_images as usize)?;
+    /// Forgets an image; those after it move up.
+    pub(crate) fn forget_image(&mut self, gpu: &Gpu, image_ix: usize) -> Result<(), Error> {
+        let Some(images) = &self.images else { return Ok(()) };
+        let mut terms = read_terms(gpu, images, images.n_images as usize)?;
         if image_ix < terms.len() {
             terms.remove(image_ix);
             terms.push([[0.0; 4]; TERM_STRIDE]);
         }
-        gpu.write(&poses.terms, 0, bytemuck::cast_slice(&terms));
+        gpu.write(&images.terms, 0, bytemuck::cast_slice(&terms));
+        Ok(())
+    }
+
+    /// Forgets all terms of images but these.
+    pub(crate) fn forget_terms_but(&mut self, gpu: &Gpu, kept: TermSet) -> Result<(), Error> {
+        let Some(images) = &self.images else { return Ok(()) };
+        let mut terms = read_terms(gpu, images, images.n_images as usize)?;
+        for (ix, term) in terms.iter_mut().flat_map(|image| image.iter_mut().enumerate()) {
+            if bits_of(kept) & (1 << ix) == 0 {
+                *term = [0.0; 4];
+            }
+        }
+        gpu.write(&images.terms, 0, bytemuck::cast_slice(&terms));
         Ok(())
     }
 
@@ -255,10 +314,9 @@ impl Learner {
             0,
             bytemuck::bytes_of(&March { most_samples: share.max(1), ..march_of(self.sizes.effort) }),
         );
-        // Whatever is behind the scene must not help to explain it.
-        let channel = |ix: u64| f32_of(unit(mixed(options.seed ^ mixed(step << 2 | ix))));
+        let [red, green, blue] = background(options, step);
         let loss = RayLoss {
-            background_srgb: [channel(0), channel(1), channel(2), 0.0],
+            background_srgb: [red, green, blue, 0.0],
             distance_weight: f32_of(options.distance_weight),
             distance_clip: DISTANCE_CLIP,
             distortion: f32_of(options.distortion),
@@ -278,7 +336,8 @@ impl Learner {
     /// Lists the networks as pictures have them, for the samples of the last step.
     pub(crate) fn record_colors(&mut self, gpu: &Gpu) {
         let Self { compiled, field, samples, slots, passes: list, .. } = self;
-        FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0] }.colors(list);
+        let terms = &field.no_terms;
+        FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0], terms }.colors(list);
     }
 
     /// Sends what is listed; the read tells when it is done.
@@ -311,7 +370,8 @@ impl Learner {
         gpu.write(&self.occupancy.thickness, 0, bytemuck::cast_slice(&finer));
         self.make_slot(gpu, 0)?;
         let Self { compiled, field, samples, occupancy, moments, slots, passes: list, .. } = self;
-        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0] };
+        let (slot, terms) = (&slots[0], &field.no_terms);
+        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, terms };
         passes.mark(list, occupancy, moments);
         list.submit(gpu);
         Ok(())
@@ -331,7 +391,8 @@ impl Learner {
         let buffer = gpu.storage_with("nerf.hints", bytemuck::cast_slice(&padded(hints)))?;
         self.make_slot(gpu, 0)?;
         let Self { compiled, field, samples, occupancy, moments, slots, passes: list, .. } = self;
-        FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0] }
+        let (slot, terms) = (&slots[0], &field.no_terms);
+        FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, terms }
             .hint(list, occupancy, moments, &buffer);
         list.submit(gpu);
         list.forget_bindings(); // The hints are used once.
@@ -345,7 +406,7 @@ impl Learner {
         Ok(())
     }
 
-    /// Draws a pinhole view, given in units of the scene's radius.
+    /// Draws a pinhole view, given in units of the scene's radius, as an image with a code would look.
     ///
     /// Rays are followed in rounds of a few samples, until none lets light through or meets anything more.
     pub(crate) fn draw(
@@ -354,6 +415,7 @@ impl Learner {
         camera: &Camera,
         background_srgb: [f32; 3],
         radius_m: f64,
+        code: [f64; N_CODE],
     ) -> Result<Picture, Error> {
         let n_pixels = camera.size_px[0] as usize * camera.size_px[1] as usize;
         self.make_canvas(gpu, n_pixels as u64)?;
@@ -361,8 +423,10 @@ impl Learner {
         gpu.write(&canvas.view, 0, bytemuck::bytes_of(&camera.view()));
         let backdrop = Backdrop { srgb: background_srgb, radius_m: f32_of(radius_m) };
         gpu.write(&canvas.backdrop, 0, bytemuck::bytes_of(&backdrop));
+        gpu.write(&canvas.terms, 0, bytemuck::cast_slice(&terms_of(&[code])));
         let Self { compiled, field, occupancy, passes: list, sizes, .. } = self;
-        let of_pixels = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot };
+        let terms = &canvas.terms;
+        let of_pixels = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, terms };
         for first in (0..n_pixels).step_by(slot.n_rays as usize) {
             let n = (n_pixels - first).min(slot.n_rays as usize);
             let [first_ray, n_rays] = [first, n].map(|ix| u32::try_from(ix).expect("an image's pixels"));
@@ -399,6 +463,36 @@ impl Learner {
         }
         Ok(())
     }
+}
+
+/// What a ray sees.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Look {
+    /// Mean squared difference of color.
+    pub(crate) error: f64,
+    /// Over the background.
+    pub(crate) rgb: [f64; 3],
+}
+
+/// Whatever is behind the scene must not help to explain it.
+fn background(options: &NerfOptions, step: u64) -> [f32; 3] {
+    [0, 1, 2].map(|ix| f32_of(unit(mixed(options.seed ^ mixed(step << 2 | ix)))))
+}
+
+/// All that is kept of the first images.
+fn read_terms(gpu: &Gpu, images: &TermBuffers, n_images: usize) -> Result<Vec<[Term; TERM_STRIDE]>, Error> {
+    gpu.read(&images.terms, n_images.min(images.n_images as usize))
+}
+
+/// Numbers of an image's code as the kernels have them.
+fn n_code() -> u32 {
+    u32::try_from(N_CODE).expect("a few")
+}
+
+/// The terms that are learned, a bit each.
+fn bits_of(learned: TermSet) -> u32 {
+    let bits = |on: bool, first: usize, n: usize| if on { ((1 << n) - 1) << first } else { 0 };
+    bits(learned.image_poses, 0, CODE) | bits(learned.image_gains, CODE, N_CODE)
 }
 
 /// How the occupancy is visited.

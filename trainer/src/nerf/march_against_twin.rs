@@ -48,7 +48,7 @@ fn samples_lie_where_something_is_no_more_than_wanted() {
     let shape = GridShape::between(2, 4, 2, 6);
     let widths = Widths::new(2, 4, 0);
     let pipelines = FieldPipelines::new(&gpu, &widths, CAPACITY, 0).unwrap();
-    let field = FieldBuffers::new(&gpu, &shape, &widths, 1).unwrap();
+    let field = FieldBuffers::new(&gpu, &shape, &widths).unwrap();
     let batch = SampleBuffers::new(&gpu, CAPACITY).unwrap();
     let occupancy =
         Occupancy::new(&gpu, &Visit { n_cells: N_CELLS, n_points: 1, kept_frac: 1.0, step: 0.1 }, false).unwrap();
@@ -78,7 +78,8 @@ fn samples_lie_where_something_is_no_more_than_wanted() {
         unused: [0; 3],
     };
     gpu.write(&slot.march, 0, bytemuck::bytes_of(&march));
-    let passes = FieldPasses { gpu: &gpu, pipelines: &pipelines, field: &field, samples: &batch, slot: &slot };
+    let terms = &field.no_terms;
+    let passes = FieldPasses { gpu: &gpu, pipelines: &pipelines, field: &field, samples: &batch, slot: &slot, terms };
     let mut list = Passes::default();
     passes.mark(&mut list, &occupancy, &moments);
     passes.count(&mut list, &occupancy);

@@ -1,7 +1,7 @@
 //! The neural field as a [`Method`].
 
 mod checkpoint;
-mod poses;
+mod images;
 
 use super::carve;
 use super::extent::Extent;
@@ -12,10 +12,10 @@ use super::sizes::Sizes;
 use crate::align::Alignment;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming, PendingRead};
-use crate::splat::{Camera, CameraFix, PosedLens, TermSet, projections};
+use crate::splat::{Camera, CameraFix, N_CODE, PosedLens, TermSet, projections};
 use crate::{Error, Keyframe, Method, Part, Picture, Progress, RenderRequest, Renewable, Split};
+use images::Trials;
 use kinematics::Stamp;
-use poses::Trial;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -43,13 +43,11 @@ pub struct NerfModel {
     /// Images whose depth was told to the field: the first so many.
     n_hinted: usize,
     in_flight: Option<InFlight>,
-    /// Whether the poses of images are learned along.
-    learns_poses: bool,
-    trial: Trial,
-    /// Images that are learned from when the trial is over.
+    /// What is learned of images along with the field.
+    learned: TermSet,
+    trials: Trials,
+    /// Images that are learned from when all trials are over.
     held_back: Vec<RayImage>,
-    /// What the trial found.
-    part: Option<Part>,
     /// Of the saved field this one came from.
     loaded_fixes: BTreeMap<String, CameraFix>,
     /// What is known about cameras, since the last step.
@@ -72,12 +70,11 @@ impl NerfModel {
     pub fn new(gpu: Arc<Gpu>, options: NerfOptions) -> Result<Self, Error> {
         Ok(Self {
             gpu,
-            learns_poses: options.cameras.gives(TermSet { image_poses: true, ..TermSet::NONE }),
-            trial: Trial::of(&options.cameras),
+            learned: images::given(&options.cameras),
+            trials: Trials::of(&options.cameras),
             options,
             images: Vec::new(),
             held_back: Vec::new(),
-            part: None,
             loaded_fixes: BTreeMap::new(),
             fixes: None,
             n_taken_back: 0,
@@ -114,19 +111,20 @@ impl NerfModel {
         self.options.effort.unwrap_or(if self.gpu.is_software() { Effort::SMALL } else { Effort::FULL })
     }
 
-    /// Makes a field where there is none, or where the scene has outgrown it. False where there is nothing to learn from.
+    /// Makes a field where there is none, or where the scene has outgrown it, with cells as fine as are due. False where there is nothing
+    /// to learn from.
     fn begin(&mut self) -> Result<bool, Error> {
         if self.images.is_empty() {
             return Ok(false);
         }
-        if !std::mem::take(&mut self.is_extent_due) && self.field.is_some() {
-            return Ok(true);
+        if std::mem::take(&mut self.is_extent_due) || self.field.is_none() {
+            self.images.par_iter().for_each(|image| {
+                image.depth_m();
+            });
+            self.fit_extent()?;
+            self.hint()?;
         }
-        self.images.par_iter().for_each(|image| {
-            image.depth_m();
-        });
-        self.fit_extent()?;
-        self.hint()?;
+        self.refine_when_due()?;
         Ok(true)
     }
 
@@ -155,7 +153,7 @@ impl NerfModel {
         }
         log::debug!("nerf: {extent:?}, {sizes:?}");
         self.settle()?;
-        self.give_up_trial();
+        self.give_up_trials()?;
         self.field = None; // Its memory is free before the next one takes some.
         let compiled = self.compiled()?;
         self.field = Some((extent, Learner::new(&self.gpu, &self.options, sizes, compiled)?));
@@ -163,8 +161,9 @@ impl NerfModel {
         Ok(())
     }
 
-    /// Tells the field what new images say about where something is, where any of them has depth.
+    /// Tells the field what new images say about where something is, where any of them has depth, and in what light they begin.
     fn hint(&mut self) -> Result<(), Error> {
+        self.begin_codes()?;
         let Some((extent, learner)) = &mut self.field else { return Ok(()) };
         if learner.sizes.has_depth {
             let keyframes: Vec<&Keyframe> = self.images[self.n_hinted..].iter().map(|image| &*image.keyframe).collect();
@@ -206,16 +205,16 @@ impl NerfModel {
 
     /// Lists the next step as the `slot_ix`-th of a submit.
     fn record(&mut self, slot_ix: usize) -> Result<(), Error> {
-        let moves_images = self.moves_images();
+        let learned = self.learned_now();
         let Some((extent, learner)) = &mut self.field else { return Ok(()) };
-        if moves_images {
-            learner.hold_poses(&self.gpu, self.images.len())?;
+        if learned.any() {
+            learner.hold_images(&self.gpu, self.images.len(), learned)?;
         }
         self.fixes = None;
         let n_rays = learner.sizes.effort.n_rays;
         let draw = Draw { seed: self.options.seed, step: self.step, n_rays, begin: BEGIN };
         let rays = rays::draw(&self.images, extent, &draw);
-        learner.record_step(&self.gpu, &self.options, slot_ix, self.step, &rays)?;
+        learner.record_step(&self.gpu, &self.options, slot_ix, self.step, &rays, learned)?;
         self.step += 1;
         Ok(())
     }
@@ -230,11 +229,11 @@ impl NerfModel {
         n
     }
 
-    fn draw(&mut self, camera: &Camera, background_srgb: [f32; 3]) -> Result<Picture, Error> {
+    fn draw(&mut self, camera: &Camera, background_srgb: [f32; 3], code: [f64; N_CODE]) -> Result<Picture, Error> {
         let Some((extent, learner)) = &mut self.field else {
             return Ok(Picture::empty(camera.size_px, background_srgb));
         };
-        learner.draw(&self.gpu, &extent.camera_in_units(camera), background_srgb, extent.radius_m)
+        learner.draw(&self.gpu, &extent.camera_in_units(camera), background_srgb, extent.radius_m, code)
     }
 }
 
@@ -257,7 +256,7 @@ impl Method for NerfModel {
             return Ok(());
         }
         keyframe.check()?;
-        let is_held_back = keyframe.split == Split::Selection && !self.trial.is_over();
+        let is_held_back = keyframe.split == Split::Selection && !self.trials.are_over();
         let image = RayImage::new(keyframe);
         if is_held_back {
             self.held_back.push(image);
@@ -273,12 +272,12 @@ impl Method for NerfModel {
         self.held_back.retain(|image| !is_meant(image));
         if let Some(ix) = self.images.iter().position(is_meant) {
             self.settle()?;
-            self.give_up_trial();
+            self.give_up_trials()?;
             self.images.remove(ix);
             self.n_hinted -= usize::from(ix < self.n_hinted);
             self.fixes = None;
             if let Some((_, learner)) = &mut self.field {
-                learner.forget_pose(&self.gpu, ix)?;
+                learner.forget_image(&self.gpu, ix)?;
             }
         }
         Ok(())
@@ -289,8 +288,8 @@ impl Method for NerfModel {
             self.settle()?;
             return Ok(0);
         }
-        self.refine_when_due()?;
         self.try_when_due()?;
+        self.begin()?; // Images that were held back have joined, before the next step and not after so many as fit into a submit.
         let most = self.steps_to_finer_cells().min(self.steps_to_trial());
         let n_steps = n.min(self.steps_per_submit()).min(most);
         let since = Instant::now();
@@ -332,7 +331,8 @@ impl Method for NerfModel {
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         // Whoever looks must not decide with which keyframes the field begins.
         self.settle()?;
-        projections::render(request, |camera| self.draw(camera, request.background_srgb))
+        let code = self.code_of(request.light_of.as_ref())?;
+        projections::render(request, |camera| self.draw(camera, request.background_srgb, code))
     }
 
     fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {
@@ -366,7 +366,7 @@ impl Method for NerfModel {
     }
 
     fn report(&self) -> Vec<Part> {
-        self.part.iter().cloned().collect()
+        self.trials.ended.clone()
     }
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {

@@ -1,6 +1,7 @@
 //! Small structs the kernels read, with the layouts of their WGSL twins.
 
 use super::reference::grid::GridShape;
+use crate::gpu::f32_of;
 
 /// `Batch` of `shared/ray_batch.wgsl`.
 #[repr(C)]
@@ -124,21 +125,34 @@ pub(crate) struct Pace {
     pub(crate) correction: [f32; 2],
 }
 
-/// `PoseRule` of `learn_poses.wgsl`.
+/// `TermRule` of `learn_images.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-pub(crate) struct PoseRule {
+pub(crate) struct TermRule {
+    pub(crate) learned: u32,
+    pub(crate) n_images: u32,
     pub(crate) turn_rate: f32,
     pub(crate) shift_rate: f32,
+    pub(crate) code_rate: f32,
     pub(crate) pull: f32,
-    pub(crate) n_images: u32,
+    pub(crate) unused: [u32; 2],
 }
 
-/// What is kept of each image, [`TERM_STRIDE`] terms of which the first [`TERMS`] are its turn and its shift, as in
+/// What is kept of each image, [`TERM_STRIDE`] terms: three of its turn, three of its shift, and its code from [`CODE`] on, as in
 /// `shared/image_terms.wgsl`: value, Adam's two means, and the steps it took.
 pub(crate) type Term = [f32; 4];
-pub(crate) const TERMS: usize = 6;
-pub(crate) const TERM_STRIDE: usize = 8;
+pub(crate) const TERM_STRIDE: usize = 9;
+pub(crate) const CODE: usize = 6;
+
+/// The terms of images that have these codes and no more.
+pub(crate) fn terms_of<const N: usize>(codes: &[[f64; N]]) -> Vec<[Term; TERM_STRIDE]> {
+    let of_image = |code: &[f64; N]| {
+        let mut terms = [[0.0; 4]; TERM_STRIDE];
+        terms[CODE..].iter_mut().zip(code).for_each(|(term, value)| term[0] = f32_of(*value));
+        terms
+    };
+    codes.iter().map(of_image).collect()
+}
 
 impl LearnRule {
     /// Of the first step.

@@ -1,11 +1,11 @@
 //! The stages of drawing and learning, as lists of passes.
 
 use super::buffers::{
-    FieldBuffers, FieldMoments, FieldSlopes, N_SHARES, Occupancy, PoseBuffers, RaySlot, SampleBuffers, StepBuffers,
+    FieldBuffers, FieldMoments, FieldSlopes, N_SHARES, Occupancy, RaySlot, SampleBuffers, StepBuffers, TermBuffers,
     n_blocks,
 };
 use super::kernels::{CHUNK_TILES, FieldPipelines, N_TILE};
-use super::params::Backdrop;
+use super::params::{Backdrop, TERM_STRIDE, Term};
 use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 use crate::splat::View;
@@ -19,6 +19,8 @@ pub(crate) struct FieldPasses<'a> {
     pub(crate) field: &'a FieldBuffers,
     pub(crate) samples: &'a SampleBuffers,
     pub(crate) slot: &'a RaySlot,
+    /// Of the images that the rays belong to.
+    pub(crate) terms: &'a Buffer,
 }
 
 /// A picture and where it is drawn.
@@ -28,6 +30,8 @@ pub(crate) struct Canvas {
     pub(crate) backdrop: Buffer,
     pub(crate) pixels: Buffer,
     pub(crate) depths: Buffer,
+    /// Of the image that it is to look like.
+    pub(crate) terms: Buffer,
     /// What the rays of a batch have seen so far.
     light: Buffer,
     pub(crate) n_pixels: u64,
@@ -40,6 +44,7 @@ impl Canvas {
             backdrop: gpu.uniform_with("nerf.backdrop", &<Backdrop as bytemuck::Zeroable>::zeroed()),
             pixels: gpu.storage("nerf.pixels", 4 * n_pixels)?,
             depths: gpu.storage("nerf.depths", 4 * n_pixels)?,
+            terms: gpu.storage("nerf.picture_terms", (TERM_STRIDE * size_of::<Term>()) as u64)?,
             light: gpu.storage("nerf.light", 32 * u64::from(n_rays))?,
             n_pixels,
         })
@@ -138,7 +143,7 @@ impl FieldPasses<'_> {
     }
 
     fn networks(&self, list: &mut Passes, pipeline: &Pipeline, held: &Buffer) {
-        let Self { gpu, field, samples, slot, .. } = *self;
+        let Self { gpu, field, samples, slot, terms, .. } = *self;
         let buffers = [
             ("batch", &samples.batch),
             ("levels", &field.levels),
@@ -147,7 +152,7 @@ impl FieldPasses<'_> {
             ("weights", &field.weights),
             ("rays", &slot.rays),
             ("spans", &samples.spans),
-            ("codes", &field.codes),
+            ("terms", terms),
             ("told", &samples.told),
             ("colors", &samples.colors),
             ("held", held),
@@ -203,23 +208,17 @@ impl FieldPasses<'_> {
     }
 
     /// Moves the rays as their images' poses were found to be moved.
-    pub(crate) fn aim(&self, list: &mut Passes, poses: &PoseBuffers) {
-        let Self { gpu, pipelines, samples, slot, .. } = *self;
-        let aimed = [("batch", &samples.batch), ("terms", &poses.terms), ("rays", &slot.rays)];
+    pub(crate) fn aim(&self, list: &mut Passes) {
+        let Self { gpu, pipelines, samples, slot, terms, .. } = *self;
+        let aimed = [("batch", &samples.batch), ("terms", terms), ("rays", &slot.rays)];
         list.dispatch(gpu, &pipelines.aim_rays, groups(slot.n_rays, 64), &aimed);
     }
 
-    /// After [`FieldPasses::backward`]: one step of the poses of all images.
-    pub(crate) fn learn_poses(
-        &self,
-        list: &mut Passes,
-        step: &StepBuffers,
-        moments: &FieldMoments,
-        poses: &PoseBuffers,
-    ) {
-        let Self { gpu, pipelines, field, samples, slot } = *self;
+    /// After [`FieldPasses::backward`]: slopes towards the poses of rays.
+    pub(crate) fn pose_slopes(&self, list: &mut Passes, step: &StepBuffers, images: &TermBuffers) {
+        let Self { gpu, pipelines, field, samples, slot, .. } = *self;
         let (batch, rays, spans) = (("batch", &samples.batch), ("rays", &slot.rays), ("spans", &samples.spans));
-        let (v_points, v_rays) = (("v_points", &poses.v_points), ("v_rays", &poses.v_rays));
+        let v_points = ("v_points", &images.v_points);
         let looked_up = [
             batch,
             ("levels", &field.levels),
@@ -231,9 +230,35 @@ impl FieldPasses<'_> {
             v_points,
         ];
         list.dispatch(gpu, &pipelines.point_slopes, groups(samples.n_samples, 64), &looked_up);
-        list.dispatch(gpu, &pipelines.ray_slopes, groups(slot.n_rays, 64), &[batch, rays, spans, v_points, v_rays]);
-        let learned = [batch, ("rule", &poses.rule), ("pace", &moments.pace), rays, v_rays, ("terms", &poses.terms)];
-        list.dispatch(gpu, &pipelines.learn_poses, poses.n_images.into(), &learned);
+        let summed = [batch, rays, spans, v_points, ("v_rays", &images.v_rays)];
+        list.dispatch(gpu, &pipelines.ray_slopes, groups(slot.n_rays, 64), &summed);
+    }
+
+    /// After [`FieldPasses::backward`]: slopes of samples towards the codes of their images.
+    pub(crate) fn code_slopes(&self, list: &mut Passes, step: &StepBuffers, images: &TermBuffers) {
+        let Self { gpu, pipelines, field, samples, .. } = *self;
+        let carried = [
+            ("batch", &samples.batch),
+            ("weights", &field.weights),
+            ("v_held", &step.v_held),
+            ("v_codes", &images.v_codes),
+        ];
+        list.dispatch(gpu, &pipelines.code_slopes, groups(samples.n_samples, 64), &carried);
+    }
+
+    /// After the slopes: one step of the terms of all images.
+    pub(crate) fn learn_images(&self, list: &mut Passes, moments: &FieldMoments, images: &TermBuffers) {
+        let Self { gpu, pipelines, samples, slot, .. } = *self;
+        let learned = [
+            ("batch", &samples.batch),
+            ("rule", &images.rule),
+            ("pace", &moments.pace),
+            ("rays", &slot.rays),
+            ("v_rays", &images.v_rays),
+            ("v_codes", &images.v_codes),
+            ("terms", &images.terms),
+        ];
+        list.dispatch(gpu, &pipelines.learn_images, images.n_images.into(), &learned);
     }
 
     /// After [`FieldPasses::forward`]: what every ray sees, its loss, and the slopes back to its samples.

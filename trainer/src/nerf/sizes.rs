@@ -29,7 +29,6 @@ pub(crate) struct Sizes {
     /// Cells of each level along an axis.
     pub(crate) n_cells: Vec<u32>,
     pub(crate) log2_entries: u32,
-    pub(crate) n_codes: u32,
     /// Whether depth tells where something is.
     pub(crate) has_depth: bool,
     /// Whether cells of the occupancy become finer once something is known.
@@ -81,7 +80,7 @@ impl Sizes {
             let fits =
                 n_entries * BYTES_PER_ENTRY <= max_bytes && n_entries * MOMENT_BYTES_PER_ENTRY <= max_binding_bytes;
             if fits {
-                return Ok(Self { n_cells: shape.n_cells, log2_entries, n_codes: 1, has_depth, refines, effort });
+                return Ok(Self { n_cells: shape.n_cells, log2_entries, has_depth, refines, effort });
             }
             if log2_entries == LEAST_LOG2_ENTRIES {
                 return Err(Error::BudgetTooSmall { max_bytes, least_bytes: n_entries * BYTES_PER_ENTRY });
@@ -103,7 +102,6 @@ impl Sizes {
             && rises
             && self.n_cells.len() <= most_levels.clamp(LEAST_LEVELS, MOST_LEVELS) as usize
             && (1..=28).contains(&self.log2_entries)
-            && self.n_codes > 0
             && (1..=1 << 20).contains(&n_rays)
             && (n_rays..=1 << 24).contains(&n_samples)
             && (4..=64).contains(&n_hidden)

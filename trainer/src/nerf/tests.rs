@@ -12,7 +12,7 @@ use crate::gpu::{Gpu, GpuOptions};
 use crate::splat::{CameraChoice, TermSet, moved};
 use crate::test_scenes as scenes;
 use crate::{Aabb, DepthMap, Error, Keyframe, Method, Picture, Projection, RenderRequest, Split};
-use kinematics::{Transform, Twist};
+use kinematics::{Stamp, Transform, Twist};
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 
@@ -286,6 +286,70 @@ fn poses_that_drift_are_found() {
     let mut unjudged = started(options(CameraChoice::Try(vec![poses])), &right);
     learn(&mut unjudged, 120);
     assert!(unjudged.report().is_empty() && mean_off_m(&mut unjudged, &right) == 0.0);
+}
+
+/// Light that changes is found along with the scene, where a trial says that it pays; images that were not learned from are drawn in
+/// that of their neighbors in time, and others in the mean light.
+#[test]
+fn light_that_changes_is_found() {
+    const GAINS: TermSet = TermSet { image_gains: true, ..TermSet::NONE };
+    let options = |cameras| NerfOptions { cameras, n_planned_steps: 480, ..options() };
+    let held_back = |keyframe: &Keyframe| keyframe.stamp.0 % 4 == 2;
+    let even: Vec<Arc<Keyframe>> = ball_on_floor(32)
+        .iter()
+        .map(|keyframe| {
+            let split = if held_back(keyframe) { Split::Selection } else { Split::Train };
+            Arc::new(Keyframe { split, ..(**keyframe).clone() })
+        })
+        .collect();
+    // In the second half a lamp is off.
+    let lit = |keyframe: &Arc<Keyframe>| {
+        let mut rgba = keyframe.rgba_srgb.to_vec();
+        if keyframe.stamp.0 >= 16 {
+            rgba.as_chunks_mut::<4>().0.iter_mut().for_each(|[color @ .., _]| color.iter_mut().for_each(|c| *c /= 2));
+        }
+        Arc::new(Keyframe { rgba_srgb: rgba.into(), ..(**keyframe).clone() })
+    };
+    let changing: Vec<Arc<Keyframe>> = even.iter().map(lit).collect();
+    let mut unchanged = started(options(CameraChoice::Try(vec![GAINS])), &even);
+    learn(&mut unchanged, 100);
+    assert!(!unchanged.report()[0].kept, "{:?}", unchanged.report());
+    assert_eq!(unchanged.n_taken().unwrap(), 100, "where the light stays nothing is taken back");
+    let mut model = started(options(CameraChoice::Try(vec![GAINS])), &changing);
+    learn(&mut model, 75); // In the midst of the trial.
+    let checkpoint = state(&mut model);
+    learn(&mut model, 200);
+    assert!(model.report()[0].kept && model.report()[0].bought_db > 1.0, "{:?}", model.report());
+    let (mut resumed, rest) = NerfModel::resume(gpu(), &checkpoint, &changing).unwrap();
+    assert_eq!(rest.len(), 8, "images held back come back");
+    rest.into_iter().for_each(|keyframe| resumed.push(keyframe).unwrap());
+    learn(&mut resumed, 200);
+    assert!(state(&mut model) == state(&mut resumed), "the trial begins again, and ends the same");
+
+    let like = |keyframe: &Keyframe, stamp: i64| RenderRequest {
+        light_of: Some((keyframe.camera.clone(), Stamp(stamp))),
+        ..request(keyframe)
+    };
+    let brightness = |picture: &Picture| picture.rgba_srgb.iter().map(|value| f64::from(*value)).sum::<f64>();
+    let [bright, dark] = [0, 31].map(|stamp| brightness(&model.render(&like(&changing[5], stamp)).unwrap()));
+    let mean = model.render(&request(&changing[5])).unwrap();
+    assert!(dark < brightness(&mean) && brightness(&mean) < bright, "{dark}, {}, {bright}", brightness(&mean));
+    let own = psnr(&model.render(&like(&changing[20], 20)).unwrap(), &changing[20]);
+    assert!(own > psnr(&model.render(&like(&changing[20], 5)).unwrap(), &changing[20]) + 2.0, "{own} dB");
+
+    let folder = tempfile::tempdir().unwrap();
+    model.save(folder.path()).unwrap();
+    let mut loaded = NerfModel::load(gpu(), folder.path()).unwrap();
+    for request in [like(&changing[5], 5), request(&changing[5])] {
+        let (drawn, again) = (model.render(&request).unwrap(), loaded.render(&request).unwrap());
+        assert!(drawn.rgba_srgb == again.rgba_srgb && drawn.depth_m == again.depth_m);
+    }
+
+    // Those that stay keep their light.
+    let before = model.render(&like(&changing[25], 25)).unwrap();
+    model.remove(&changing[3].camera, changing[3].stamp).unwrap();
+    assert!(model.render(&like(&changing[25], 25)).unwrap().rgba_srgb == before.rgba_srgb);
+    learn(&mut model, 203);
 }
 
 /// Numbers that no camera should send change nothing that they do not have to.

@@ -132,7 +132,12 @@ pub struct CameraFix {
     pub drift_share: f64,
     /// Logarithms of the gains of red, green and blue of the images learned from, likewise.
     pub log_gains: BTreeMap<i64, [f64; 3]>,
+    /// What a neural field knows of light and exposure of the images learned from, likewise; what the numbers mean is its own affair.
+    pub codes: BTreeMap<i64, [f64; N_CODE]>,
 }
+
+/// Numbers of an image's code.
+pub const N_CODE: usize = 1;
 
 impl Default for CameraFix {
     fn default() -> Self {
@@ -150,6 +155,7 @@ impl Default for CameraFix {
             drift: BTreeMap::new(),
             drift_share: 1.0,
             log_gains: BTreeMap::new(),
+            codes: BTreeMap::new(),
         }
     }
 }

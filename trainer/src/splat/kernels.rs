@@ -40,6 +40,7 @@ const SHARED: &[Source] = &[
     TILES,
     source!("block_bins"),
     source!("camera_terms"),
+    source!("term_step"),
     source!("camera_sums", "camera_sums_none"),
     source!("ssim_bindings"),
     source!("ssim_upstream", "ssim_upstream_window"),

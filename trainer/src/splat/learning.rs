@@ -51,6 +51,7 @@ pub(super) fn request(world_from_camera: Transform) -> RenderRequest {
         far_m: 100.0,
         crop: None,
         background_srgb: [0.0; 3],
+        light_of: None,
     }
 }
 

@@ -28,8 +28,8 @@ mod trainer;
 mod trials;
 mod views;
 
-pub use camera_terms::{CameraFix, PosedLens, TermSet};
-pub(crate) use camera_terms::{drift_share, moved, shares_lens};
+pub use camera_terms::{CameraFix, N_CODE, PosedLens, TermSet};
+pub(crate) use camera_terms::{between, drift_share, moved, shares_lens};
 pub use options::SplatOptions;
 pub(crate) use params::{Camera, View};
 pub use trainer::SplatTrainer;

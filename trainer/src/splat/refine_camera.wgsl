@@ -11,6 +11,7 @@
 #import model
 #import camera_terms
 #import status
+#import term_step
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> model: Model;
@@ -22,8 +23,6 @@
 @group(0) @binding(7) var<uniform> rule: CameraRule;
 
 override GRADIENTS_ONLY: bool = false;   // Stored as the terms' values, for tests.
-const BETAS = vec2f(0.9, 0.99);
-const EPSILON = 1e-15;
 var<workgroup> wg_sums: array<vec4f, 1024>; // [256, 4]
 
 fn slope_of(term: u32) -> f32 {
@@ -43,14 +42,6 @@ fn rate_of(term: u32) -> f32 {
     if term == DELAY { return rule.delay_rate; }
     if term < LOG_GAIN { return rule.focal_rate; }
     return rule.gain_rate;
-}
-
-fn step_of(before: vec4f, slope: f32, rate: f32, pull: f32) -> vec4f {
-    let moments = mix(vec2f(slope, slope * slope), before.yz, BETAS);
-    let n_steps = before.w + 1.0;
-    let unbiased = moments / (1.0 - pow(BETAS, vec2f(n_steps)));
-    let value = before.x - rate * unbiased.x / (sqrt(unbiased.y) + EPSILON);
-    return vec4f(value * (1.0 - pull), moments, n_steps);
 }
 
 fn finite(x: f32) -> bool {
@@ -92,10 +83,10 @@ fn main(@builtin(local_invocation_index) lane: u32) {
         if learns { terms[lens.camera_terms + term].x = slope; }
     } else {
         if learns && (rule.of_camera & bit) != 0u {
-            terms[lens.camera_terms + term] = step_of(terms[lens.camera_terms + term], slope, rate_of(term), 0.0);
+            terms[lens.camera_terms + term] = stepped(terms[lens.camera_terms + term], slope, rate_of(term), 0.0);
         }
         if learns && (rule.of_image & bit) != 0u {
-            terms[lens.image_terms + term] = step_of(terms[lens.image_terms + term], slope, rate_of(term), rule.image_pull);
+            terms[lens.image_terms + term] = stepped(terms[lens.image_terms + term], slope, rate_of(term), rule.image_pull);
         }
     }
 }

@@ -42,13 +42,6 @@ pub enum CameraChoice {
     Try(Vec<TermSet>),
 }
 
-impl CameraChoice {
-    /// Whether all of some terms are learned from the first step on.
-    pub(crate) fn gives(&self, terms: TermSet) -> bool {
-        matches!(self, Self::Given(set) if set.and(terms) == *set)
-    }
-}
-
 impl Default for CameraChoice {
     fn default() -> Self {
         Self::Given(TermSet::default())

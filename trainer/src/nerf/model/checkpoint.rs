@@ -1,7 +1,7 @@
 //! The state of a field on the way, and a field in a folder.
 
 use super::NerfModel;
-use super::poses::{Saved, Trial};
+use super::images::{Saved, Trials};
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::gpu::{Buffer, Gpu, PendingRead};
 use crate::nerf::extent::Extent;
@@ -11,7 +11,7 @@ use crate::nerf::params::{TERM_STRIDE, Term};
 use crate::nerf::rays::RayImage;
 use crate::nerf::sizes::Sizes;
 use crate::seen::{self, Seen};
-use crate::splat::read_about;
+use crate::splat::{TermSet, read_about};
 use crate::{Error, Keyframe, Method, Part};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -34,17 +34,13 @@ struct State {
     n_hinted: usize,
     /// Where there is a field.
     field: Option<(Extent, Sizes)>,
-    #[serde(default)]
-    learns_poses: bool,
-    #[serde(default)]
-    is_trial_over: bool,
-    #[serde(default)]
-    part: Option<Part>,
-    #[serde(default)]
+    /// Of images, along with the field.
+    learned: TermSet,
+    are_trials_over: bool,
+    parts: Vec<Part>,
     n_taken_back: u64,
-    /// How many images the poses that are learned have room for.
-    #[serde(default)]
-    n_poses: Option<u32>,
+    /// How many images there is room for in what is learned of them.
+    n_terms: Option<u32>,
 }
 
 fn written(state: &State) -> Result<serde_json::Value, Error> {
@@ -53,6 +49,14 @@ fn written(state: &State) -> Result<serde_json::Value, Error> {
 
 fn bad_state(reason: String) -> Error {
     Error::CheckpointState { reason }
+}
+
+impl Saved {
+    /// How many images there is room for in what is learned of them.
+    fn n_terms(&self) -> Option<u32> {
+        let terms = self.arrays.iter().find(|array| array.name == TERMS)?;
+        u32::try_from(terms.bytes.len() / (TERM_STRIDE * size_of::<Term>())).ok()
+    }
 }
 
 impl Learner {
@@ -78,7 +82,7 @@ impl Learner {
             ]
             .map(|(name, buffer)| (name.to_owned(), buffer)),
         );
-        all.extend(self.poses.iter().map(|poses| (TERMS.to_owned(), &poses.terms)));
+        all.extend(self.images.iter().map(|images| (TERMS.to_owned(), &images.terms)));
         all
     }
 }
@@ -109,29 +113,28 @@ impl NerfModel {
             is_extent_due: self.is_extent_due,
             n_hinted: self.n_hinted,
             field: self.field.as_ref().map(|(extent, learner)| (*extent, learner.sizes.clone())),
-            learns_poses: self.learns_poses,
-            is_trial_over: self.trial.is_over(),
-            part: self.part.clone(),
+            learned: self.learned,
+            are_trials_over: self.trials.are_over(),
+            parts: self.trials.ended.clone(),
             n_taken_back: self.n_taken_back,
-            n_poses: self.field.as_ref().and_then(|(_, learner)| Some(learner.poses.as_ref()?.n_images)),
+            n_terms: self.field.as_ref().and_then(|(_, learner)| Some(learner.images.as_ref()?.n_images)),
         })
     }
 
     /// The field as it is; what was sent must be done.
     pub(super) fn saved(&self) -> Result<Saved, Error> {
         let reads = self.field.as_ref().map_or(Vec::new(), |(_, learner)| begin_read(&self.gpu, learner.learned()));
-        Ok(Saved { arrays: finish(&self.gpu, reads)?, step: self.step })
+        Ok(Saved { arrays: finish(&self.gpu, reads)?, step: self.step, learned: self.learned })
     }
 
     /// Makes the field what it was; what was sent must be done.
     pub(super) fn put_back(&mut self, saved: &Saved) -> Result<(), Error> {
-        self.step = saved.step;
+        (self.step, self.learned) = (saved.step, saved.learned);
         self.fixes = None;
         let Some((_, learner)) = &mut self.field else { return Ok(()) };
-        let terms = saved.arrays.iter().find(|array| array.name == TERMS);
-        match terms {
-            Some(terms) => learner.hold_poses(&self.gpu, terms.bytes.len() / (TERM_STRIDE * size_of::<Term>()))?,
-            None => learner.forget_poses(),
+        match saved.n_terms() {
+            Some(n_terms) => learner.hold_images(&self.gpu, n_terms as usize, saved.learned)?,
+            None => learner.forget_images(),
         }
         for (name, buffer) in learner.learned() {
             if let Some(array) = saved.arrays.iter().find(|array| array.name == name) {
@@ -145,8 +148,8 @@ impl NerfModel {
     pub(super) fn take_checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         self.settle()?;
         let (gpu, mut state) = (self.gpu.clone(), self.state()?);
-        if let Trial::With { before } | Trial::Without { before, .. } = &self.trial {
-            (state.step, state.learns_poses, state.n_poses) = (before.step, false, None);
+        if let Some(before) = self.trials.before() {
+            (state.step, state.learned, state.n_terms) = (before.step, before.learned, before.n_terms());
             let (state, arrays) = (written(&state)?, before.arrays.clone());
             return Ok(PendingCheckpoint::new(move || Ok(Checkpoint::new(METHOD, state, arrays))));
         }
@@ -171,8 +174,8 @@ impl NerfModel {
             sizes.check()?;
             let compiled = model.compiled()?;
             let mut learner = Learner::new(&model.gpu, &model.options, sizes.clone(), compiled)?;
-            if let Some(n_poses) = state.n_poses {
-                learner.hold_poses(&model.gpu, n_poses as usize)?;
+            if let Some(n_terms) = state.n_terms {
+                learner.hold_images(&model.gpu, n_terms as usize, state.learned)?;
             }
             for (name, buffer) in buffers(&learner) {
                 model.gpu.write(buffer, 0, checkpoint.array(&name, buffer.bytes())?);
@@ -181,11 +184,8 @@ impl NerfModel {
         }
         model.step = state.step;
         model.n_taken_back = state.n_taken_back;
-        model.learns_poses = state.learns_poses;
-        model.part.clone_from(&state.part);
-        if state.is_trial_over {
-            model.trial = Trial::Over;
-        }
+        model.learned = state.learned;
+        model.trials = Trials::of(&state.options.cameras).after(state.parts.clone(), state.are_trials_over);
         Ok((model, state))
     }
 

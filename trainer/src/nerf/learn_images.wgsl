@@ -1,0 +1,84 @@
+// learn_images: sums the slopes of an image's rays and samples, and takes one step of Adam for its pose and its code.
+//
+// threads   one workgroup of 64 per image
+// reads     batch, rule, pace, rays (in the order of their images, as are their samples), v_rays [n_rays, 2], v_codes [n_samples]
+// writes    terms [n_images, TERM_STRIDE]
+// twin      nerf/reference/pose.rs, nerf/reference/field.rs, optim/reference.rs
+//
+// Terms are pulled towards nothing: an image moves, and differs in its light, only as far as it has reason to.
+
+#import folded
+#import ray_batch
+#import learn_rule
+#import image_terms
+#import term_step
+
+struct TermRule {
+    learned: u32,          // bit i: term i
+    n_images: u32,
+    turn_rate: f32,        // radians a step, at the start
+    shift_rate: f32,       // units of the radius a step, at the start
+    code_rate: f32,        // a step, at the start
+    pull: f32,             // share of a term that is lost in a step, at the start
+    unused: vec2u,
+}
+
+@group(0) @binding(0) var<storage, read> batch: Batch;
+@group(0) @binding(1) var<uniform> rule: TermRule;
+@group(0) @binding(2) var<storage, read> pace: Pace;
+@group(0) @binding(3) var<storage, read> rays: array<Ray>;
+@group(0) @binding(4) var<storage, read> v_rays: array<vec4f>;
+@group(0) @binding(5) var<storage, read> v_codes: array<vec4f>;
+@group(0) @binding(6) var<storage, read_write> terms: array<vec4f>;
+
+const MOST = 1e30;
+const PARTS = 3u;          // turn, shift, code: three terms each
+
+var<workgroup> wg_sums: array<vec4f, 192>; // [PARTS, 64]
+
+// The first ray of an image that is not before this one.
+fn first_ray_of(image: u32) -> u32 {
+    var begin = 0u;
+    var end = batch.n_rays;
+    while begin < end {
+        let middle = (begin + end) / 2u;
+        if rays[middle].code < image { begin = middle + 1u; } else { end = middle; }
+    }
+    return begin;
+}
+
+fn first_sample_of(ray: u32) -> u32 {
+    if ray < batch.n_rays { return rays[ray].first_sample; }
+    return batch.n_samples;
+}
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let image = folded(wg, n_wgs);
+    let begin = first_ray_of(image);
+    let end = first_ray_of(image + 1u);
+    var sums = array<vec4f, PARTS>();
+    for (var ix = begin + lane; ix < end; ix += 64u) {
+        sums[0] += v_rays[2u * ix];
+        sums[1] += v_rays[2u * ix + 1u];
+    }
+    let end_sample = first_sample_of(end);
+    for (var ix = first_sample_of(begin) + lane; ix < end_sample; ix += 64u) { sums[2] += v_codes[ix]; }
+    for (var part = 0u; part < PARTS; part++) { wg_sums[part * 64u + lane] = sums[part]; }
+    workgroupBarrier(); // All have told.
+    for (var stride = 32u; stride > 0u; stride /= 2u) {
+        if lane < stride {
+            for (var part = 0u; part < PARTS; part++) { wg_sums[part * 64u + lane] += wg_sums[part * 64u + lane + stride]; }
+        }
+        workgroupBarrier(); // This half holds what the other knew.
+    }
+    let part = min(lane / 3u, PARTS - 1u);
+    let slope = wg_sums[part * 64u][lane % 3u];
+    let is_learned = lane < TERM_STRIDE && (rule.learned & (1u << lane)) != 0u;
+    // What is not finite teaches nothing; nor does an image without rays.
+    if image < rule.n_images && is_learned && begin < end && abs(slope) < MOST {
+        let at = image * TERM_STRIDE + lane;
+        let rate = pace.rate_frac * vec3f(rule.turn_rate, rule.shift_rate, rule.code_rate)[part];
+        terms[at] = stepped(terms[at], slope, rate, rule.pull * pace.rate_frac);
+    }
+}
