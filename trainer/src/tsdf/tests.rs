@@ -430,4 +430,17 @@ fn frame_of_640x480() {
     let begin = std::time::Instant::now();
     let mesh = model.mesh().unwrap();
     eprintln!("mesh: {} triangles, {:.1} ms of wall time", mesh.triangles.len(), begin.elapsed().as_secs_f64() * 1e3);
+    for ix in 12..16 {
+        model.push(frame(ix)).unwrap();
+        fuse_all(&mut model);
+        let begin = std::time::Instant::now();
+        let n = model.update_mesh().unwrap();
+        let updated = begin.elapsed().as_secs_f64() * 1e3;
+        let mesh = model.mesh().unwrap();
+        let joined = begin.elapsed().as_secs_f64() * 1e3 - updated;
+        eprintln!(
+            "mesh after one more frame: {n} blocks anew {updated:.1} ms, {} triangles joined {joined:.1} ms of wall time",
+            mesh.triangles.len()
+        );
+    }
 }
