@@ -65,12 +65,18 @@ impl Live {
         }
     }
 
-    /// Whether a limit was reached, the devices failed, or they ended and left nothing to train on.
+    /// Whether a limit was reached or cannot be, the devices failed, or they ended and left nothing to train on.
     pub(crate) fn is_over(&self) -> bool {
         // Where one reached its limit, the others are waited for as long as they can reach theirs.
         let is_done = |session: &Session| session.is_over() || (self.feed.ended() && session.is_idle());
         let reached = self.sessions.iter().any(Session::is_over) && self.sessions.iter().all(is_done);
-        reached || self.feed.broke_off() || (self.feed.ended() && !self.can_train())
+        reached || self.is_through() || self.feed.broke_off() || (self.feed.ended() && !self.can_train())
+    }
+
+    /// Whether the devices ended, and steps were asked for that no model can make without them. Where none were asked for
+    /// there is no end: what is known is shown.
+    pub(crate) fn is_through(&self) -> bool {
+        self.is_finished() && self.sessions.iter().any(|session| session.steps_missing().is_some_and(|n| n > 0))
     }
 
     /// Keyframes held, in order of acceptance.

@@ -338,6 +338,11 @@ impl Session {
         self.limits.seconds.is_some_and(|secs| self.secs() >= secs) || self.has_all_steps()
     }
 
+    /// Steps asked for that it has not made; `None` where no number was asked for.
+    pub(crate) fn steps_missing(&self) -> Option<u64> {
+        Some(self.limits.steps?.saturating_sub(self.method.progress().step))
+    }
+
     /// Whether it made all the steps that were asked for: nothing changes it any more.
     pub(crate) fn has_all_steps(&self) -> bool {
         self.limits.steps.is_some_and(|steps| self.method.progress().step >= steps)

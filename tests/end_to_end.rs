@@ -123,6 +123,13 @@ fn a_distance_field_is_built_live_replayed_scored_drawn_and_gone_on_with() {
     let replayed = events(folder, &[&replay[..], &run].concat());
     assert_eq!(replayed.last().expect("events")["checkpoint_sha256"], done["checkpoint_sha256"]);
     let mesh = std::fs::read(folder.join("live/mesh.glb")).expect("a mesh");
+
+    // More steps than there are keyframes: it ends when the recording is through.
+    let more = ["run", "rig.toml", "--from", "scan.mcap", "--method", "tsdf", "--steps", "100000", "--json"];
+    let ended = events(folder, &[&more[..], &["--listen", "127.0.0.1:0", "--out", "ended"]].concat());
+    let steps = number(ended.last().expect("events"), "steps");
+    assert!((10.0..1000.0).contains(&steps), "{steps} steps");
+
     assert!(mesh.starts_with(b"glTF") && mesh.len() > 50_000, "{} bytes", mesh.len());
 
     scores_a_saved_model_alike(folder, psnr);

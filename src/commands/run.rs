@@ -48,7 +48,7 @@ pub(crate) struct Args {
     /// Stop after S seconds, counted from the first image [default: run until Ctrl-C]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
-    /// Stop after N optimiser steps
+    /// Stop after N optimiser steps, or when the devices ended and there is nothing left to fuse
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
     /// With a lockstep simulation or a recording only: steps between two keyframes [default: 10]
@@ -158,6 +158,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         live.step()?;
         live.render();
         live.publish()?;
+    }
+    if live.is_through() {
+        log::info!("the devices ended, and all they told is in the model: no step is left to make");
     }
     stop.ask();
     save(live, args, &rig, folders, &damage)

@@ -30,8 +30,10 @@
 
 // Least cosine between ray and normal that distances are shortened by: normals of steeper surfaces are mostly noise.
 const MIN_TURNED = 0.3;
-// One look through a solid voxel takes back as many looks at it.
-const CARVING = 4.0;
+// One look through a solid voxel takes back as many looks at it: where what lies behind is one truncation away, and where it is
+// two away or more. What is nearer may be no more than a wrong pose.
+const CARVING_NEAR = 1.0;
+const CARVING_FAR = 4.0;
 // Colors are kept this near to the surface, voxels: what pictures and meshes read.
 const COLOR_VOXELS = 2.0;
 
@@ -117,7 +119,8 @@ fn fuse(at: u32, point_in_field: vec3f) -> Fused {
         // Seen through: that counts against what was taken for solid, and says nothing else. How well it is seen is a
         // matter of where the voxel is, not of what lies behind it.
         if weight == 0u || stored_distance(old) >= 0.0 { return UNCHANGED; }
-        let lost = u32(max(floor(CARVING * WEIGHT_ONE * min(1.0, 1.0 / (point.z * point.z)) + 0.5), 1.0));
+        let carving = mix(CARVING_NEAR, CARVING_FAR, min(distance_m / truncation_m - 1.0, 1.0));
+        let lost = u32(max(floor(carving * WEIGHT_ONE * min(1.0, 1.0 / (point.z * point.z)) + 0.5), 1.0));
         geometry[at] = select(old - (lost << 16u), 0u, lost >= weight);
         return Fused(true, 0u);
     }

@@ -134,8 +134,14 @@ impl TsdfModel {
 
     /// The surface in world as it is now; only what changed since the last call is made anew.
     pub fn mesh(&mut self) -> Result<Mesh, Error> {
+        self.update_mesh()?;
+        Ok(self.lattice.as_ref().map_or_else(Mesh::default, |lattice| self.mesher.mesh(lattice)))
+    }
+
+    /// Makes the triangles of what changed since the last call, without joining them to one mesh; says how many blocks it were.
+    pub fn update_mesh(&mut self) -> Result<usize, Error> {
         self.settle()?;
-        let (Some(lattice), Some(field)) = (&self.lattice, &self.field) else { return Ok(Mesh::default()) };
+        let (Some(lattice), Some(field)) = (&self.lattice, &self.field) else { return Ok(0) };
         self.due.extend(field.take_changed(&self.gpu)?);
         let places = field.places(&self.gpu)?;
         let slots: Vec<u32> =
@@ -145,8 +151,7 @@ impl TsdfModel {
         let waiting = self.due.iter().filter_map(|place| Some((*place, self.waiting.get(place)?.clone())));
         let changed: Blocks = waiting.chain(resident).collect();
         self.due.clear();
-        self.mesher.update(lattice, changed);
-        Ok(self.mesher.mesh(lattice))
+        Ok(self.mesher.update(lattice, changed))
     }
 
     /// Most blocks the GPU may hold.

@@ -5,7 +5,8 @@
 // writes    readings [n_pixels]: depth in metres, 0 where it is not to be believed; and the ray with z = 1 times the
 //           surface's unit normal, so that a difference in z times it is a distance along the normal
 // twin      tsdf/reference/readings.rs
-// source    normals by differences: Newcombe et al. 2011 (KinectFusion), section 3.2; the limit on slopes is ours
+// source    normals by differences: Newcombe et al. 2011 (KinectFusion), section 3.2; the limit on slopes, and normals
+//           from further apart where a surface is flat, are ours
 
 #import field
 #import depth_frame
@@ -16,6 +17,10 @@
 @group(0) @binding(3) var<storage, read_write> readings: array<vec2f>;
 
 const MIN_DEPTH_M = 0.01;
+// Normals are taken from pixels this far apart on each side where noise allows no better.
+const WIDE = 3;
+// Of the noise, what three depths in a row may bend by and still be of one flat surface: 2.45 standard deviations.
+const FLAT_NOISES = 6.0;
 // Steepest surface that is believed, as change of depth over distance across: steeper ones are edges.
 const MAX_SLOPE = 6.0;
 
@@ -41,12 +46,19 @@ struct Side {
 fn beside(pixel: vec2i, step: vec2i, center_m: f32, focal_px: f32) -> Side {
     let high_m = depth_at(pixel + step);
     let low_m = depth_at(pixel - step);
-    let limit = MAX_SLOPE * center_m / focal_px + 6.0 * field.noise_per_m2 * center_m * center_m;
+    let noise_m = field.noise_per_m2 * center_m * center_m;
+    let limit = MAX_SLOPE * center_m / focal_px + 6.0 * noise_m;
     let has_high = high_m > 0.0;
     let has_low = low_m > 0.0;
     let edge = (has_high && abs(high_m - center_m) > limit) || (has_low && abs(low_m - center_m) > limit);
-    let high = point_at(pixel + select(vec2i(0), step, has_high), select(center_m, high_m, has_high));
-    let low = point_at(pixel - select(vec2i(0), step, has_low), select(center_m, low_m, has_low));
+    // Where the surface goes on straight, within its noise, from further apart: then noise turns the normal less.
+    let far_high_m = depth_at(pixel + WIDE * step);
+    let far_low_m = depth_at(pixel - WIDE * step);
+    let is_flat = min(far_high_m, far_low_m) > 0.0
+        && abs(far_high_m - 2.0 * center_m + far_low_m) <= FLAT_NOISES * noise_m;
+    let reach = select(select(vec2i(0), vec2i(1), vec2<bool>(has_high, has_low)), vec2i(WIDE), is_flat);
+    let high = point_at(pixel + reach.x * step, select(select(center_m, high_m, has_high), far_high_m, is_flat));
+    let low = point_at(pixel - reach.y * step, select(select(center_m, low_m, has_low), far_low_m, is_flat));
     return Side(has_high || has_low, edge, high - low);
 }
 

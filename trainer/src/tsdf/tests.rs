@@ -96,6 +96,58 @@ fn what_moved_away_is_carved() {
     assert!(picture.depth_m.iter().filter(|depth| **depth > 0.0).count() > 5000);
 }
 
+/// Looks past where a thing was until its mesh is gone, after `n_with` looks at it: of its upper part, and of the part that is
+/// nearer to the floor than five voxels.
+fn looks_until_gone(n_with: usize) -> [usize; 2] {
+    const MOST: usize = 200;
+    let [with, without] =
+        [&[scenes::ball(AT), scenes::floor()][..], &[scenes::floor()]].map(|shapes| scenes::ring(shapes, AT, 4));
+    let mut n_pushed = 0;
+    let mut model = TsdfModel::new(gpu(), scenes::options()).unwrap();
+    let mut look = |model: &mut TsdfModel, views: &[Arc<Keyframe>]| {
+        let mut keyframe = views[n_pushed % views.len()].clone();
+        Arc::make_mut(&mut keyframe).stamp = Stamp(i64::try_from(n_pushed).unwrap());
+        n_pushed += 1;
+        model.push(keyframe).unwrap();
+        fuse_all(model);
+    };
+    let left = |model: &mut TsdfModel| {
+        let mesh = model.mesh().unwrap();
+        let origin = Vector3::from(mesh.origin_m);
+        let places = mesh.positions_m.iter().map(|place| Point3::from(Vector3::from(place.map(f64::from)) + origin));
+        let of_ball = places.filter(|place| (place - AT).norm() < 0.33 && place.z > -0.28);
+        let (upper, lower): (Vec<_>, Vec<_>) = of_ball.partition(|place| place.z > -0.2);
+        [upper.len(), lower.len()]
+    };
+    for _ in 0..n_with {
+        look(&mut model, &with);
+    }
+    let before = left(&mut model);
+    let mut gone = [MOST; 2];
+    for n in 1..=MOST {
+        look(&mut model, &without);
+        let now = left(&mut model);
+        for part in 0..2 {
+            if 50 * now[part] <= before[part] {
+                gone[part] = gone[part].min(n);
+            }
+        }
+        if gone.iter().all(|n| *n < MOST) {
+            break;
+        }
+    }
+    gone
+}
+
+#[test]
+fn what_moved_away_is_gone_after_fewer_looks_than_it_had() {
+    // Measured 2, 7 and 17 looks; the lower part, which new distances overwrite, is gone at once.
+    for (n_with, most) in [(8, 3), (32, 9), (100, 20)] {
+        let gone = looks_until_gone(n_with);
+        assert!(gone.iter().all(|n| *n <= most), "{n_with} looks at it, gone after {gone:?}");
+    }
+}
+
 #[test]
 fn without_depth_there_is_nothing_and_nothing_breaks() {
     let mut model = TsdfModel::new(gpu(), TsdfOptions::default()).unwrap();
@@ -430,4 +482,17 @@ fn frame_of_640x480() {
     let begin = std::time::Instant::now();
     let mesh = model.mesh().unwrap();
     eprintln!("mesh: {} triangles, {:.1} ms of wall time", mesh.triangles.len(), begin.elapsed().as_secs_f64() * 1e3);
+    for ix in 12..16 {
+        model.push(frame(ix)).unwrap();
+        fuse_all(&mut model);
+        let begin = std::time::Instant::now();
+        let n = model.update_mesh().unwrap();
+        let updated = begin.elapsed().as_secs_f64() * 1e3;
+        let mesh = model.mesh().unwrap();
+        let joined = begin.elapsed().as_secs_f64() * 1e3 - updated;
+        eprintln!(
+            "mesh after one more frame: {n} blocks anew {updated:.1} ms, {} triangles joined {joined:.1} ms of wall time",
+            mesh.triangles.len()
+        );
+    }
 }

@@ -90,11 +90,12 @@ impl Found {
 pub(super) fn march(blocks: &Blocks, place: Place, voxel_m: f64) -> BlockMesh {
     let around = Surrounded::new(blocks, place);
     let mut mesh = BlockMesh::default();
+    let Some(corners) = Corners::of(&around) else { return mesh };
     let mut found = Found(vec![u32::MAX; 9 * 9 * 9 * 3]);
     for z in 0..BLOCK_EDGE {
         for y in 0..BLOCK_EDGE {
             for x in 0..BLOCK_EDGE {
-                let Some(case) = case_of(&around, [x, y, z]) else { continue };
+                let Some(case) = corners.case_of([x, y, z]) else { continue };
                 for triangle in &CASES[case] {
                     let corners = triangle.map(|edge| vertex(&mut mesh, &mut found, &around, [x, y, z], edge, voxel_m));
                     mesh.triangles.push(corners);
@@ -105,12 +106,26 @@ pub(super) fn march(blocks: &Blocks, place: Place, voxel_m: f64) -> BlockMesh {
     mesh
 }
 
-/// Which corners lie inside; `None` where one was not seen.
-fn case_of(around: &Surrounded<'_>, voxel: Place) -> Option<usize> {
-    (0..8).try_fold(0, |case, corner| {
-        let distance = around.distance(moved(voxel, corner))?;
-        Some(case | usize::from(distance < 0.0) << corner)
-    })
+/// Whether the corners of a block's cubes lie inside, 9 along each axis, x fastest; `None`: not seen.
+struct Corners(Vec<Option<bool>>);
+
+impl Corners {
+    /// `None` where no surface passes between them.
+    fn of(around: &Surrounded<'_>) -> Option<Self> {
+        let places = (0..9 * 9 * 9).map(|ix| [ix % 9, ix / 9 % 9, ix / 81]);
+        let is_inside: Vec<_> = places.map(|voxel| Some(around.distance(voxel)? < 0.0)).collect();
+        (is_inside.contains(&Some(true)) && is_inside.contains(&Some(false))).then_some(Self(is_inside))
+    }
+
+    /// Which corners of the cube that begins at `voxel` lie inside; `None` where one was not seen.
+    fn case_of(&self, voxel: Place) -> Option<usize> {
+        let [x, y, z] = voxel.map(|along| usize::try_from(along).expect("cubes begin in the block"));
+        let first = 81 * z + 9 * y + x;
+        (0..8).try_fold(0, |case, corner| {
+            let is_inside = self.0[first + (corner & 1) + 9 * (corner >> 1 & 1) + 81 * (corner >> 2)]?;
+            Some(case | usize::from(is_inside) << corner)
+        })
+    }
 }
 
 /// The vertex on an edge of the cube that begins at `voxel`, made at its first use.

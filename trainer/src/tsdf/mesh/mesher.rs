@@ -2,7 +2,7 @@
 
 use super::Mesh;
 use super::march::{BlockMesh, Key, march};
-use crate::tsdf::block::{Blocks, Place};
+use crate::tsdf::block::{BLOCK_EDGE, Blocks, Place};
 use crate::tsdf::chosen::Lattice;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
@@ -41,11 +41,13 @@ impl Mesher {
     pub fn mesh(&self, lattice: &Lattice) -> Mesh {
         let mut whole = Mesh { origin_m: lattice.anchor_m, ..Mesh::default() };
         let mut known: HashMap<Key, u32> = HashMap::new();
-        for mesh in self.meshes.values() {
+        for (place, mesh) in &self.meshes {
+            let is_shared =
+                |(voxel, _): &Key| (0..3).any(|axis| matches!(voxel[axis] - BLOCK_EDGE * place[axis], 0 | BLOCK_EDGE));
             let mut places = Vec::with_capacity(mesh.keys.len());
             for (ix, key) in mesh.keys.iter().enumerate() {
                 let next = u32::try_from(whole.positions_m.len()).unwrap_or(u32::MAX);
-                let at = *known.entry(*key).or_insert(next);
+                let at = if is_shared(key) { *known.entry(*key).or_insert(next) } else { next };
                 if at == next {
                     whole.positions_m.push(mesh.positions_m[ix]);
                     whole.normals.push(mesh.normals[ix]);

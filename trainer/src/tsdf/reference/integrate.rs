@@ -24,7 +24,8 @@ pub struct Voxel {
 pub type VoxelBlocks = BTreeMap<Place, Vec<Voxel>>;
 
 const MIN_TURNED: f64 = 0.3;
-const CARVING: f64 = 4.0;
+const CARVING_NEAR: f64 = 1.0;
+const CARVING_FAR: f64 = 4.0;
 const COLOR_VOXELS: f64 = 2.0;
 
 /// Fuses a keyframe with depth into the blocks given.
@@ -68,7 +69,9 @@ fn fuse(
     let gain = nearness * (reading.turned / ray_m).powi(2) * behind;
     if distance_m > truncation_m {
         if voxel.weight > 0.0 && voxel.distance_m < 0.0 {
-            let lost = (CARVING * 256.0 * (1.0 / (point.z * point.z)).min(1.0) + 0.5).floor().max(1.0);
+            let beyond = (distance_m / truncation_m - 1.0).min(1.0);
+            let carving = CARVING_NEAR + (CARVING_FAR - CARVING_NEAR) * beyond;
+            let lost = (carving * 256.0 * (1.0 / (point.z * point.z)).min(1.0) + 0.5).floor().max(1.0);
             if lost >= voxel.weight {
                 (voxel.distance_m, voxel.weight) = (0.0, 0.0);
             } else {

@@ -13,6 +13,8 @@ pub struct Reading {
     pub turned: f64,
 }
 
+const WIDE: i64 = 3;
+const FLAT_NOISES: f64 = 6.0;
 const MIN_DEPTH_M: f64 = 0.01;
 const MAX_SLOPE: f64 = 6.0;
 
@@ -48,12 +50,18 @@ fn reading(depth: &DepthMap, lattice: &Lattice, pixel: [i64; 2]) -> Reading {
             other[axis] += step;
             depth_at(depth, lattice, other).map(|depth_m| (other, depth_m))
         };
+        let wide = [at(WIDE), at(-WIDE)];
+        let is_flat = match wide {
+            [Some((_, high_m)), Some((_, low_m))] => (high_m - 2.0 * center_m + low_m).abs() <= FLAT_NOISES * noise_m,
+            _ => false,
+        };
         let sides = [at(1), at(-1)];
         if sides.iter().flatten().any(|(_, depth_m)| (depth_m - center_m).abs() > limit) || sides == [None, None] {
             return None;
         }
+        let taken = if is_flat { wide } else { sides };
         let [high, low] =
-            sides.map(|side| side.map_or_else(|| point(pixel, center_m), |(at, depth_m)| point(at, depth_m)));
+            taken.map(|side| side.map_or_else(|| point(pixel, center_m), |(at, depth_m)| point(at, depth_m)));
         Some(high - low)
     };
     let (Some(x), Some(y)) = (beside(0), beside(1)) else { return Reading::default() };
