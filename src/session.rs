@@ -24,6 +24,8 @@ use trainer::{Keyframe, Method, Part, Picture, Progress, RenderRequest, Split};
 const N_PROFILED: usize = 21;
 /// After large buffers were let go of, drivers are slow for a while.
 const BEFORE_PROFILE: Duration = Duration::from_millis(700);
+/// Where drawing takes longer, a mark scores fewer test images: a neural field takes seconds for each on a processor.
+const MOST_SCORING_AT_MARKS: Duration = Duration::from_secs(60);
 /// Points of the PSNR curve that are kept; past them every second one goes.
 const MAX_HISTORY: usize = 512;
 
@@ -570,7 +572,7 @@ impl Session {
 
     fn score_at_end(&mut self, seconds: f64) -> anyhow::Result<Outcome> {
         std::mem::swap(&mut self.evaluator, &mut self.last_evaluator);
-        let per_image = self.score(usize::MAX, &Stop::default())?.unwrap_or_default();
+        let per_image = self.off_the_clock(Self::score_all)?;
         let progress = self.method.progress();
         Ok(Outcome {
             seconds,
@@ -583,26 +585,42 @@ impl Session {
         })
     }
 
-    /// Scores at most `most` test keyframes, off the clock; `None` where `stop` was asked before all were drawn.
-    fn score(&mut self, most: usize, stop: &Stop) -> anyhow::Result<Option<Vec<ImageScores>>> {
+    /// Scores all test keyframes.
+    fn score_all(&mut self) -> anyhow::Result<Vec<ImageScores>> {
+        let tests: Vec<Arc<Keyframe>> = self.tests.iter().cloned().collect();
+        self.evaluator.score_all(self.method.as_mut(), tests.iter())
+    }
+
+    /// Scores test keyframes spread over all, as many as a mark may; `None` where it was asked to stop meanwhile.
+    fn score_some(&mut self) -> anyhow::Result<Option<Vec<ImageScores>>> {
+        let before = Instant::now();
+        let stride = self.tests.len().div_ceil(self.most_at_marks).max(1);
+        let mut tests: Vec<(usize, Arc<Keyframe>)> = self.tests.iter().step_by(stride).cloned().enumerate().collect();
+        // However many of them are scored, they are spread evenly.
+        tests.sort_by_key(|(ix, _)| ix.reverse_bits());
+        let stop = self.stop.clone();
+        let goes_on = |n: usize| !stop.asked() && (n == 0 || before.elapsed() < MOST_SCORING_AT_MARKS);
+        let wanted = tests.iter().enumerate().take_while(|(n, _)| goes_on(*n)).map(|(_, (_, keyframe))| keyframe);
+        let images = self.evaluator.score_all(self.method.as_mut(), wanted)?;
+        Ok((!stop.asked()).then_some(images))
+    }
+
+    /// Does what is not training: time stands still meanwhile.
+    fn off_the_clock<T>(&mut self, work: impl FnOnce(&mut Self) -> anyhow::Result<T>) -> anyhow::Result<T> {
         self.gpu.wait()?;
         self.note_look();
         let before = Instant::now();
-        let stride = self.tests.len().div_ceil(most).max(1);
-        let tests: Vec<Arc<Keyframe>> = self.tests.iter().step_by(stride).cloned().collect();
-        let wanted = tests.iter().take_while(|_| !stop.asked());
-        let images = self.evaluator.score_all(self.method.as_mut(), wanted)?;
+        let done = work(self)?;
         self.gpu.wait()?;
         self.clock.exclude(before.elapsed());
-        Ok((images.len() == tests.len()).then_some(images))
+        Ok(done)
     }
 
     fn tell_mark(&mut self) -> anyhow::Result<()> {
         // What was queued up to here belongs to the mark.
         self.gpu.wait()?;
         let seconds = self.secs();
-        let stop = self.stop.clone();
-        let Some(images) = self.score(self.most_at_marks, &stop)? else { return Ok(()) };
+        let Some(images) = self.off_the_clock(Self::score_some)? else { return Ok(()) };
         for image in &images {
             self.newest_psnr.insert((image.camera.clone(), image.stamp_nanos), image.psnr);
         }
