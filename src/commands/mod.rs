@@ -34,14 +34,16 @@ pub(crate) fn run(command: Command) -> anyhow::Result<Exit> {
     }
 }
 
-/// Opens the GPU; `FIELDRIG_GPU` says which one of several, and `FIELDRIG_GPU_FEATURES=none` does without everything
-/// optional.
+/// Opens the GPU; `FIELDRIG_GPU` says which one of several, `FIELDRIG_GPU_FEATURES=none` does without everything
+/// optional, and `no-matrices` without cooperative matrices.
 fn open_gpu() -> anyhow::Result<Arc<Gpu>> {
     open_gpu_with(GpuOptions::default())
 }
 
 fn open_gpu_with(options: GpuOptions) -> anyhow::Result<Arc<Gpu>> {
-    let optional_features = std::env::var_os("FIELDRIG_GPU_FEATURES").is_none_or(|value| value != "none");
+    let features = std::env::var_os("FIELDRIG_GPU_FEATURES");
+    let [optional_features, matrices] =
+        ["none", "no-matrices"].map(|word| features.as_ref().is_none_or(|it| it != word));
     let adapter = match std::env::var("FIELDRIG_GPU") {
         Ok(text) => {
             let is_wrong = |_| BadArgument(format!("FIELDRIG_GPU: {text:?} is not the number of a GPU"));
@@ -49,5 +51,5 @@ fn open_gpu_with(options: GpuOptions) -> anyhow::Result<Arc<Gpu>> {
         }
         Err(_) => None,
     };
-    Ok(Gpu::open(&GpuOptions { optional_features, adapter, ..options })?)
+    Ok(Gpu::open(&GpuOptions { optional_features, matrices, adapter, ..options })?)
 }

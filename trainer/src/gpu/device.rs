@@ -10,6 +10,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 pub struct GpuOptions {
     /// Whether optional features of the adapter may be used.
     pub optional_features: bool,
+    /// Whether cooperative matrices are among them.
+    pub matrices: bool,
     /// Whether floats may be added atomically: in an order of their own, so nothing that learns wants it.
     pub float_atomics: bool,
     /// Lowers the largest binding, bytes; for tests of buffer limits.
@@ -20,7 +22,7 @@ pub struct GpuOptions {
 
 impl Default for GpuOptions {
     fn default() -> Self {
-        Self { optional_features: true, float_atomics: false, max_binding_bytes: None, adapter: None }
+        Self { optional_features: true, matrices: true, float_atomics: false, max_binding_bytes: None, adapter: None }
     }
 }
 
@@ -82,10 +84,20 @@ impl Gpu {
         if let Some(bytes) = options.max_binding_bytes {
             limits.max_storage_buffer_binding_size = limits.max_storage_buffer_binding_size.min(bytes);
         }
+        let experimental_features = if optional.half_matrices {
+            // SAFETY: kernels with cooperative matrices are our own; each load and store stays within its array.
+            #[expect(unsafe_code, reason = "cooperative matrices are experimental in wgpu")]
+            unsafe {
+                wgpu::ExperimentalFeatures::enabled()
+            }
+        } else {
+            wgpu::ExperimentalFeatures::disabled()
+        };
         let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
             label: Some("fieldrig"),
             required_features: optional.features(),
             required_limits: limits.clone(),
+            experimental_features,
             memory_hints: wgpu::MemoryHints::Performance,
             ..wgpu::DeviceDescriptor::default()
         }))
@@ -108,8 +120,9 @@ impl Gpu {
         let subgroups =
             self.optional.subgroup_lanes.map_or("no subgroups".to_owned(), |lanes| format!("subgroups of {lanes}"));
         let timestamps = if self.optional.timestamps { "timestamps" } else { "no timestamps" };
+        let matrices = if self.optional.half_matrices { "matrices of f16" } else { "no matrices of f16" };
         format!(
-            "{} ({:?}, {:?}, {} {}), {subgroups}, {timestamps}",
+            "{} ({:?}, {:?}, {} {}), {subgroups}, {timestamps}, {matrices}",
             info.name, info.device_type, info.backend, info.driver, info.driver_info
         )
     }

@@ -13,6 +13,20 @@ pub struct Optional {
     pub timestamps: bool,
     /// Atomic additions of floats; only a measurement wants them, and says where there are none.
     pub float_atomics: bool,
+    /// Products of 16x16 matrices of f16, summed in f32, each worked out by a subgroup; without them neural fields work in f32.
+    pub half_matrices: bool,
+}
+
+/// What kernels with matrices of f16 need.
+const HALF_MATRICES: wgpu::Features = wgpu::Features::EXPERIMENTAL_COOPERATIVE_MATRIX.union(wgpu::Features::SHADER_F16);
+
+/// Whether matrices of the size and types that our kernels have are among those that the adapter multiplies.
+fn has_half_matrices(adapter: &wgpu::Adapter) -> bool {
+    adapter.cooperative_matrix_properties().iter().any(|offered| {
+        [offered.m_size, offered.n_size, offered.k_size] == [16; 3]
+            && offered.ab_type == wgpu::CooperativeScalarType::F16
+            && offered.cr_type == wgpu::CooperativeScalarType::F32
+    })
 }
 
 impl Optional {
@@ -27,6 +41,11 @@ impl Optional {
             subgroup_lanes: (allowed && subgroups).then_some(info.subgroup_min_size),
             timestamps: allowed && features.contains(wgpu::Features::TIMESTAMP_QUERY),
             float_atomics: allowed && options.float_atomics && features.contains(wgpu::Features::SHADER_FLOAT32_ATOMIC),
+            half_matrices: allowed
+                && options.matrices
+                && subgroups
+                && features.contains(HALF_MATRICES)
+                && has_half_matrices(adapter),
         }
     }
 
@@ -36,6 +55,7 @@ impl Optional {
         features.set(wgpu::Features::SUBGROUP, self.subgroup_lanes.is_some());
         features.set(wgpu::Features::TIMESTAMP_QUERY, self.timestamps);
         features.set(wgpu::Features::SHADER_FLOAT32_ATOMIC, self.float_atomics);
+        features.set(HALF_MATRICES, self.half_matrices);
         features
     }
 }

@@ -14,6 +14,8 @@ pub(crate) struct FieldBuffers {
     pub(crate) grid: Buffer,
     /// Of all layers of both networks, `[outputs, inputs]` each.
     pub(crate) weights: Buffer,
+    /// The same as two numbers of f16 each, as they were before the step, where layers are matrices.
+    pub(crate) half_weights: Option<Buffer>,
     /// What kernels bind and do not use.
     pub(crate) nothing: Buffer,
     /// Terms of no image.
@@ -131,7 +133,7 @@ pub(crate) struct SampleBuffers {
 /// What a step keeps of its samples and rays.
 #[derive(Debug)]
 pub(crate) struct StepBuffers {
-    /// What goes into each layer.
+    /// What goes into each layer, in numbers of [`Widths::bytes_per_number`], as the next.
     pub(crate) held: Buffer,
     /// Slopes towards what comes out of each layer.
     pub(crate) v_held: Buffer,
@@ -180,10 +182,20 @@ impl FieldBuffers {
             levels: gpu.storage_with("nerf.levels", bytemuck::cast_slice(&levels))?,
             grid: gpu.storage("nerf.grid", 8 * u64::from(shape.n_entries_in_all()))?,
             weights: gpu.storage("nerf.weights", 4 * u64::from(widths.n_weights()))?,
+            half_weights: if widths.halves {
+                Some(gpu.storage("nerf.half_weights", 4 * u64::from(widths.n_padded_weights()))?)
+            } else {
+                None
+            },
             nothing: gpu.storage("nerf.nothing", 16)?,
             no_terms: gpu.storage("nerf.no_terms", 16)?,
             n_entries: shape.n_entries_in_all(),
         })
+    }
+
+    /// Weights as layers take them.
+    pub(crate) fn working_weights(&self) -> &Buffer {
+        self.half_weights.as_ref().unwrap_or(&self.weights)
     }
 }
 
@@ -228,15 +240,15 @@ impl StepBuffers {
     /// For so many rays and samples.
     pub(crate) fn new(gpu: &Gpu, widths: &Widths, n_rays: u32, n_samples: u32) -> Result<Self, Error> {
         let floats = |name: &str, n_rows: u32, width: u32| gpu.storage(name, 4 * u64::from(n_rows) * u64::from(width));
-        let in_tiles = n_samples.next_multiple_of(N_TILE);
+        let in_tiles = u64::from(n_samples.next_multiple_of(N_TILE)) * u64::from(widths.bytes_per_number());
         Ok(Self {
-            held: floats("nerf.held", in_tiles, widths.n_held())?,
-            v_held: floats("nerf.v_held", in_tiles, widths.n_slopes())?,
+            held: gpu.storage("nerf.held", in_tiles * u64::from(widths.n_held()))?,
+            v_held: gpu.storage("nerf.v_held", in_tiles * u64::from(widths.n_slopes()))?,
             v_log_density: floats("nerf.v_log_density", n_samples, 1)?,
             v_colors: floats("nerf.v_colors", n_samples, 4)?,
             seen: floats("nerf.seen", n_rays, 4)?,
             ray_errors: floats("nerf.ray_errors", n_rays, 2)?,
-            partial_sums: floats("nerf.partial_sums", n_samples.div_ceil(N_CHUNK), widths.n_weights())?,
+            partial_sums: floats("nerf.partial_sums", n_samples.div_ceil(N_CHUNK), widths.n_padded_weights())?,
         })
     }
 }

@@ -5,13 +5,14 @@
 // writes    v_codes [n_samples]
 // twin      nerf/reference/field.rs
 
+#import number
 #import folded
 #import ray_batch
 #import network_tile
 
 @group(0) @binding(0) var<storage, read> batch: Batch;
 @group(0) @binding(1) var<storage, read> weights: array<vec4f>;
-@group(0) @binding(2) var<storage, read> v_held: array<vec4f>;
+@group(0) @binding(2) var<storage, read> v_held: array<Four>;
 @group(0) @binding(3) var<storage, read_write> v_codes: array<vec4f>;
 
 override N_CODE: u32;
@@ -23,11 +24,11 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let first = (sample / TILE * n_slope_rows() + v_hidden_1_row()) * PARTS + sample % TILE / 4u;
     var slope = vec4f(0.0);
     for (var row = 0u; row < N_HIDDEN; row++) {
-        let v = v_held[first + row * PARTS][sample % 4u];
+        let v = f32(v_held[first + row * PARTS][sample % 4u]);
         for (var k = 0u; k < N_CODE; k++) {
             let weight = row * N_COLOR_IN + N_HARMONICS + N_HANDED_ON + k;
             slope[k] += v * weights[hidden_1_weights() + weight / 4u][weight % 4u];
         }
     }
-    v_codes[sample] = slope;
+    v_codes[sample] = slope / slope_scale(batch.n_rays);
 }

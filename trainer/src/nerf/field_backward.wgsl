@@ -7,20 +7,23 @@
 // writes    v_held [n_tiles, n_slope_rows, 8], v_grid [n_entries, 2] (slope times scale), counts: [0] saturated contributions
 // twin      nerf/reference/field.rs, nerf/reference/grid.rs
 
+#import number
 #import folded
 #import ray_batch
 #import hash_grid
 #import network_tile
+#import rows
+#import backward_layer
 
 @group(0) @binding(0) var<storage, read> batch: Batch;
 @group(0) @binding(1) var<storage, read> levels: array<Level>;
 @group(0) @binding(2) var<storage, read> points: array<vec4f>;
-@group(0) @binding(3) var<storage, read> weights: array<vec4f>;
-@group(0) @binding(4) var<storage, read> held: array<vec4f>;
+@group(0) @binding(3) var<storage, read> weights: array<Four>;
+@group(0) @binding(4) var<storage, read> held: array<Four>;
 @group(0) @binding(5) var<storage, read> v_log_density: array<f32>;
 @group(0) @binding(6) var<storage, read> v_colors: array<vec4f>;
 @group(0) @binding(7) var<storage, read> scales: array<f32>;
-@group(0) @binding(8) var<storage, read_write> v_held: array<vec4f>;
+@group(0) @binding(8) var<storage, read_write> v_held: array<Four>;
 @group(0) @binding(9) var<storage, read_write> v_grid: array<atomic<i32>>;
 @group(0) @binding(10) var<storage, read_write> counts: array<atomic<u32>>;
 
@@ -32,7 +35,7 @@ const N_OF_COLOR = 3u;             // layers of the second network
 const N_LAYERS = 5u;
 
 fn keep(tile: u32, row: u32, part: u32, value: vec4f) {
-    v_held[(tile * n_slope_rows() + row) * PARTS + part] = value;
+    v_held[(tile * n_slope_rows() + row) * PARTS + part] = narrowed(value);
 }
 
 struct Layer {
@@ -55,51 +58,34 @@ fn layer_of(ix: u32) -> Layer {
     }
 }
 
-// Slopes towards the inputs of a layer, from rows of a bank to rows of the other.
-fn work_out(layer: Layer, tile: u32, lane: u32) {
-    let part = lane % PARTS;
-    let n_words = layer.n_in / 4u;
-    for (var group = lane / PARTS; group < n_words; group += LANES / PARTS) {
-        var sums: mat4x4f; // a column a row
-        for (var j = 0u; j < layer.n_out; j += 4u) {
-            let at = layer.from_bank + j * STRIDE + part;
-            let v = mat4x4f(wg_rows[at], wg_rows[at + STRIDE], wg_rows[at + 2u * STRIDE], wg_rows[at + 3u * STRIDE]);
-            let row = layer.first_weight + j * n_words + group;
-            let w = mat4x4f(weights[row], weights[row + n_words], weights[row + 2u * n_words], weights[row + 3u * n_words]);
-            sums += v * transpose(w);
-        }
-        for (var i = 0u; i < 4u; i++) {
-            var sum = sums[i];
-            let row = 4u * group + i;
-            if layer.cut_row != NOT_CUT {
-                let was = held[(tile * n_held_rows() + layer.cut_row + row) * PARTS + part];
-                sum = select(vec4f(0.0), sum, was > vec4f(0.0));
-            }
-            if layer.kept_row != NOT_KEPT { keep(tile, layer.kept_row + row, part, sum); }
-            wg_rows[(BANK - layer.from_bank) + row * STRIDE + part] = sum;
-        }
+// Slopes towards what goes into a layer, as they go on.
+fn finished(layer: Layer, tile: u32, row: u32, part: u32, sum: vec4f) -> vec4f {
+    var v = sum;
+    if layer.cut_row != NOT_CUT {
+        let was = held[(tile * n_held_rows() + layer.cut_row + row) * PARTS + part];
+        v = select(vec4f(0.0), v, was > Four());
     }
-    workgroupBarrier(); // The rows are there before the next layer reads them, and this one has read what that overwrites.
+    if layer.kept_row != NOT_KEPT { keep(tile, layer.kept_row + row, part, v); }
+    return v;
 }
 
 // What the compositing tells, in the first bank.
 fn color_slopes(tile: u32, lane: u32) {
-    for (var part = lane; part < PARTS; part += LANES) {
-        var v: mat4x4f;
+    for (var item = lane; item < N_COLORS * PARTS; item += LANES) {
+        let row = item / PARTS;
+        let part = item % PARTS;
+        var v = vec4f(0.0);
         for (var i = 0u; i < 4u; i++) {
             let sample = tile * TILE + 4u * part + i;
-            if sample < batch.n_samples { v[i] = v_colors[sample]; }
+            if sample < batch.n_samples && row < 4u { v[i] = v_colors[sample][row] * slope_scale(batch.n_rays); }
         }
-        let rows = transpose(v);
-        for (var row = 0u; row < N_COLORS; row++) {
-            wg_rows[row * STRIDE + part] = rows[row];
-            keep(tile, v_color_row() + row, part, rows[row]);
-        }
+        put_four(0u, row, part, v);
+        keep(tile, v_color_row() + row, part, v);
     }
     workgroupBarrier(); // The slopes are there before the last layer reads them.
 }
 
-// What goes towards density and what was handed on, from the second bank to the first.
+// What goes towards density and what was handed on, to the first bank.
 fn told_slopes(tile: u32, lane: u32) {
     for (var item = lane; item < N_TOLD * PARTS; item += LANES) {
         let row = item / PARTS;
@@ -108,12 +94,12 @@ fn told_slopes(tile: u32, lane: u32) {
         if row == 0u {
             for (var i = 0u; i < 4u; i++) {
                 let sample = tile * TILE + 4u * part + i;
-                if sample < batch.n_samples { v[i] = v_log_density[sample]; }
+                if sample < batch.n_samples { v[i] = v_log_density[sample] * slope_scale(batch.n_rays); }
             }
         } else {
-            v = wg_rows[BANK + (N_HARMONICS - 1u + row) * STRIDE + part];
+            v = out_four(BANK, N_HARMONICS - 1u + row, part);
         }
-        wg_rows[row * STRIDE + part] = v;
+        put_four(0u, row, part, v);
         keep(tile, v_told_row() + row, part, v);
     }
     workgroupBarrier(); // The slopes are there before the layer reads them.
@@ -136,9 +122,9 @@ fn scatter(tile: u32, lane: u32) {
         let level_ix = item / PARTS;
         let level = levels[level_ix];
         let part = item % PARTS;
-        let scale = scales[level_ix];
-        let v_0 = wg_rows[2u * level_ix * STRIDE + part] * scale;
-        let v_1 = wg_rows[(2u * level_ix + 1u) * STRIDE + part] * scale;
+        let scale = scales[level_ix] / slope_scale(batch.n_rays);
+        let v_0 = out_four(0u, 2u * level_ix, part) * scale;
+        let v_1 = out_four(0u, 2u * level_ix + 1u, part) * scale;
         let first = tile * TILE + 4u * part;
         if first >= batch.n_samples { continue; }
         let n = min(4u, batch.n_samples - first);
@@ -158,9 +144,7 @@ fn scatter(tile: u32, lane: u32) {
     }
 }
 
-@compute @workgroup_size(LANES)
-fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
-    let tile = folded(wg, n_wgs);
+fn work(tile: u32, lane: u32) {
     if tile * TILE < batch.n_samples {
         color_slopes(tile, lane);
         // A loop, so that the code of a layer is there once: it is long.

@@ -6,15 +6,42 @@ use crate::gpu::{Gpu, Kernel, Pipeline, Source};
 
 macro_rules! shared {
     ($name:literal) => {
-        Source { name: $name, text: include_str!(concat!("../shared/", $name, ".wgsl")) }
+        shared!($name, $name)
+    };
+    ($name:literal, $file:expr) => {
+        Source { name: $name, text: include_str!(concat!("../shared/", $file, ".wgsl")) }
     };
 }
 
 macro_rules! kernel {
     ($name:literal) => {
-        Kernel { source: Source { name: $name, text: include_str!(concat!($name, ".wgsl")) }, shared: SHARED }
+        kernel!($name, SHARED)
+    };
+    ($name:literal, $shared:expr) => {
+        Kernel { source: Source { name: $name, text: include_str!(concat!($name, ".wgsl")) }, shared: $shared }
     };
 }
+
+/// What the kernels import that have layers or what goes through them, with numbers of one kind.
+macro_rules! layers {
+    ($numbers:literal) => {
+        &[
+            shared!("folded"),
+            shared!("ray_batch"),
+            shared!("hash_grid"),
+            shared!("network_tile"),
+            shared!("image_terms"),
+            shared!("sh"),
+            shared!("number", concat!("number_", $numbers)),
+            shared!("rows", concat!("rows_", $numbers)),
+            shared!("forward_layer", concat!("forward_layer_", $numbers)),
+            shared!("backward_layer", concat!("backward_layer_", $numbers)),
+        ]
+    };
+}
+/// In f32, and on matrices of f16.
+const WHOLE: &[Source] = layers!("whole");
+const HALF: &[Source] = layers!("half");
 
 const SHARED: &[Source] = &[
     shared!("folded"),
@@ -36,7 +63,6 @@ const SHARED: &[Source] = &[
     shared!("network_tile"),
     shared!("ray_loss"),
     shared!("learn_rule"),
-    shared!("sh"),
 ];
 
 /// All kernels of this folder.
@@ -54,15 +80,21 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("picture_rays"),
     kernel!("show_rays"),
     kernel!("find_samples"),
-    kernel!("field_forward"),
+    kernel!("field_forward", WHOLE),
+    kernel!("field_forward", HALF),
     kernel!("composite"),
-    kernel!("field_backward"),
+    kernel!("field_backward", WHOLE),
+    kernel!("field_backward", HALF),
     kernel!("aim_rays"),
-    kernel!("point_slopes"),
+    kernel!("point_slopes", WHOLE),
+    kernel!("point_slopes", HALF),
     kernel!("ray_slopes"),
-    kernel!("code_slopes"),
+    kernel!("code_slopes", WHOLE),
+    kernel!("code_slopes", HALF),
     kernel!("learn_images"),
     kernel!("weight_slopes"),
+    kernel!("weight_slopes_half", HALF),
+    kernel!("halve_weights", HALF),
     kernel!("learn_weights"),
     kernel!("learn_grid"),
     kernel!("end_step"),
@@ -73,38 +105,73 @@ pub(crate) const N_TILE: u32 = 32;
 /// Tiles of samples that one partial sum of slopes towards weights goes over.
 pub(crate) const CHUNK_TILES: u32 = 16;
 pub(crate) const N_CHUNK: u32 = CHUNK_TILES * N_TILE;
+/// Threads that work on a tile with matrices: whole subgroups of any size.
+const HALF_LANES: u32 = 128;
 /// Most rows of a layer.
 const MOST_ROWS: u32 = 64;
+/// Rows of a matrix.
+const MATRIX: u32 = 16;
 /// Numbers that the first network tells, and colors, as the kernels have them.
 const N_TOLD: u32 = 16;
 const N_COLORS: u32 = 4;
 
-/// Widths of both networks as the kernels have them: multiples of four.
+/// Widths of both networks as the kernels have them: multiples of four, and of what a matrix has where layers are matrices. Those that
+/// fields have are multiples of both, so that files fit all adapters.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Widths {
     pub(crate) n_features: u32,
     pub(crate) n_hidden: u32,
     pub(crate) n_color_in: u32,
     pub(crate) n_code: u32,
+    /// Whether layers are matrices of f16 ([`crate::gpu::Optional::half_matrices`]): what goes through them is f16 then.
+    pub(crate) halves: bool,
+    /// Features, hidden and inputs of the second network as they are without matrices.
+    used: [u32; 3],
+}
+
+fn layers_of([n_features, n_hidden, n_color_in]: [u32; 3]) -> [[u32; 2]; 5] {
+    [[n_features, n_hidden], [n_hidden, N_TOLD], [n_color_in, n_hidden], [n_hidden, n_hidden], [n_hidden, N_COLORS]]
 }
 
 impl Widths {
-    pub(crate) fn new(n_levels: u32, hidden: u32, n_code: u32) -> Self {
+    pub(crate) fn new(gpu: &Gpu, n_levels: u32, hidden: u32, n_code: u32) -> Self {
         let inputs = u32::try_from(N_DIRECTION).expect("16") + 15 + n_code;
-        let [n_features, n_hidden, n_color_in] = [2 * n_levels, hidden, inputs].map(|width| width.next_multiple_of(4));
+        let halves = gpu.optional().half_matrices;
+        let used = [2 * n_levels, hidden, inputs].map(|width| width.next_multiple_of(4));
+        let [n_features, n_hidden, n_color_in] =
+            if halves { used.map(|width| width.next_multiple_of(MATRIX)) } else { used };
         assert!(n_features.max(n_hidden).max(n_color_in) <= MOST_ROWS, "a layer is wider than its rows");
-        Self { n_features, n_hidden, n_color_in, n_code }
+        Self { n_features, n_hidden, n_color_in, n_code, halves, used }
     }
 
     /// Inputs and outputs of all layers of both networks, in the order of their weights.
     pub(crate) fn layers(&self) -> [[u32; 2]; 5] {
-        let Self { n_features, n_hidden, n_color_in, .. } = *self;
-        [[n_features, n_hidden], [n_hidden, N_TOLD], [n_color_in, n_hidden], [n_hidden, n_hidden], [n_hidden, N_COLORS]]
+        layers_of([self.n_features, self.n_hidden, self.n_color_in])
+    }
+
+    /// The same as they are without matrices: what lies beyond begins at zero and stays there.
+    pub(crate) fn used_layers(&self) -> [[u32; 2]; 5] {
+        layers_of(self.used)
     }
 
     /// Weights of all layers.
     pub(crate) fn n_weights(&self) -> u32 {
         self.layers().iter().map(|[n_in, n_out]| n_in * n_out).sum()
+    }
+
+    /// Outputs of the last layer: three colors, and nothing.
+    fn n_colors(&self) -> u32 {
+        if self.halves { MATRIX } else { N_COLORS }
+    }
+
+    /// Weights of all layers as they are worked with, and sums of slopes towards them: those of the outputs that are nothing come last.
+    pub(crate) fn n_padded_weights(&self) -> u32 {
+        self.n_weights() + (self.n_colors() - N_COLORS) * self.n_hidden
+    }
+
+    /// Bytes of a number that is kept for the way back.
+    pub(crate) fn bytes_per_number(&self) -> u32 {
+        if self.halves { 2 } else { 4 }
     }
 
     /// Numbers of a sample that are kept for the way back: what goes into each layer.
@@ -114,7 +181,7 @@ impl Widths {
 
     /// Slopes of a sample: towards what comes out of each layer, and towards what the grid holds.
     pub(crate) fn n_slopes(&self) -> u32 {
-        self.layers().iter().map(|[_, n_out]| n_out).sum::<u32>() + self.n_features
+        self.layers().iter().map(|[_, n_out]| n_out).sum::<u32>() + self.n_colors() - N_COLORS + self.n_features
     }
 }
 
@@ -138,6 +205,8 @@ pub(crate) struct FieldPipelines {
     pub(crate) densities: Pipeline,
     pub(crate) colors: Pipeline,
     pub(crate) forward: Pipeline,
+    /// Where layers are matrices of f16.
+    pub(crate) halve_weights: Option<Pipeline>,
     pub(crate) composite: Pipeline,
     pub(crate) field_backward: Pipeline,
     pub(crate) aim_rays: Pipeline,
@@ -154,29 +223,38 @@ pub(crate) struct FieldPipelines {
 impl FieldPipelines {
     /// For so many samples at most; `of_picture` is where the terms of a picture lie among those that it is drawn with.
     pub(crate) fn new(gpu: &Gpu, widths: &Widths, n_samples: u32, of_picture: u32) -> Result<Self, Error> {
-        let Widths { n_features, n_hidden, n_color_in, n_code } = *widths;
+        let Widths { n_features, n_hidden, n_color_in, n_code, halves, .. } = *widths;
         let sizes = [
             ("N_FEATURES", f64::from(n_features)),
             ("N_HIDDEN", f64::from(n_hidden)),
             ("N_COLOR_IN", f64::from(n_color_in)),
-            ("LANES", f64::from(2 * n_hidden)),
+            ("N_COLORS", f64::from(widths.n_colors())),
+            ("LANES", f64::from(if halves { HALF_LANES } else { 2 * n_hidden })),
         ];
+        let layered = |[whole, half]: [Kernel; 2]| if halves { half } else { whole };
         let with = |more: &[(&'static str, f64)]| [&sizes[..], more].concat();
         let forward = |colors: f64, keeps: f64| {
             let kind = [("N_CODE", f64::from(n_code)), ("COLORS", colors), ("KEEPS", keeps)];
-            Pipeline::new(gpu, kernel!("field_forward"), &with(&kind))
+            Pipeline::new(gpu, layered([kernel!("field_forward", WHOLE), kernel!("field_forward", HALF)]), &with(&kind))
         };
         // A thread has 16 weights.
         let most_weights = widths.layers().iter().map(|[n_in, n_out]| n_in * n_out).max().expect("five layers");
-        let sums = [("SUM_LANES", f64::from(most_weights / 16)), ("CHUNK_TILES", f64::from(CHUNK_TILES))];
+        let chunk = ("CHUNK_TILES", f64::from(CHUNK_TILES));
+        let sums = if halves { vec![chunk] } else { vec![chunk, ("SUM_LANES", f64::from(most_weights / 16))] };
         let hint = |kind: f64| Pipeline::new(gpu, kernel!("hint_cells"), &[("KIND", kind)]);
         let plain = |kernel: Kernel| Pipeline::new(gpu, kernel, &[]);
         // These take long to compile.
         let ((densities, colors), (learned, (field_backward, weight_slopes))) = rayon::join(
             || rayon::join(|| forward(0.0, 0.0), || forward(1.0, 0.0)),
             || {
-                let backward = || Pipeline::new(gpu, kernel!("field_backward"), &sizes);
-                let slopes = || Pipeline::new(gpu, kernel!("weight_slopes"), &with(&sums));
+                let backward = || {
+                    let kernel = layered([kernel!("field_backward", WHOLE), kernel!("field_backward", HALF)]);
+                    Pipeline::new(gpu, kernel, &sizes)
+                };
+                let slopes = || {
+                    let kernel = layered([kernel!("weight_slopes"), kernel!("weight_slopes_half", HALF)]);
+                    Pipeline::new(gpu, kernel, &with(&sums))
+                };
                 rayon::join(|| forward(1.0, 1.0), || rayon::join(backward, slopes))
             },
         );
@@ -196,15 +274,28 @@ impl FieldPipelines {
             densities: densities?,
             colors: colors?,
             forward: learned?,
+            halve_weights: halves.then(|| plain(kernel!("halve_weights", HALF))).transpose()?,
             composite: plain(kernel!("composite"))?,
             field_backward: field_backward?,
             aim_rays: plain(kernel!("aim_rays"))?,
-            point_slopes: Pipeline::new(gpu, kernel!("point_slopes"), &sizes)?,
+            point_slopes: Pipeline::new(
+                gpu,
+                layered([kernel!("point_slopes", WHOLE), kernel!("point_slopes", HALF)]),
+                &sizes,
+            )?,
             ray_slopes: plain(kernel!("ray_slopes"))?,
-            code_slopes: Pipeline::new(gpu, kernel!("code_slopes"), &with(&[("N_CODE", n_code.into())]))?,
+            code_slopes: Pipeline::new(
+                gpu,
+                layered([kernel!("code_slopes", WHOLE), kernel!("code_slopes", HALF)]),
+                &with(&[("N_CODE", n_code.into())]),
+            )?,
             learn_images: plain(kernel!("learn_images"))?,
             weight_slopes: weight_slopes?,
-            learn_weights: Pipeline::new(gpu, kernel!("learn_weights"), &[("CHUNK", f64::from(N_CHUNK))])?,
+            learn_weights: Pipeline::new(
+                gpu,
+                kernel!("learn_weights"),
+                &[("CHUNK", f64::from(N_CHUNK)), ("N_SUMS", f64::from(widths.n_padded_weights() / 4))],
+            )?,
             learn_grid: plain(kernel!("learn_grid"))?,
             end_step: plain(kernel!("end_step"))?,
         })

@@ -1,7 +1,7 @@
 // learn_weights: sums the slopes towards the weights of all layers over the chunks of samples, and takes one step of Adam.
 //
 // threads   256 per 16 times 4 weights: 16 share the chunks among them
-// reads     rule, pace, batch, partial_sums [n_chunks, n_weights]
+// reads     rule, pace, batch, partial_sums [n_chunks, N_SUMS]
 // writes    weights [n_weights], moments [n_weights / 4, 2] (first and second of 4 weights)
 // twin      optim/reference.rs
 // source    Kingma and Ba 2015; pull of Loshchilov and Hutter 2019 (AdamW)
@@ -17,6 +17,7 @@
 @group(0) @binding(5) var<storage, read_write> moments: array<vec4f>;
 
 override CHUNK: u32;       // samples
+override N_SUMS: u32;      // vec4 of a chunk; those behind the weights are of none
 
 const WORDS = 16u;         // vec4 of weights of a workgroup
 const SHARES = 16u;
@@ -31,7 +32,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) lane:
     let n_chunks = (batch.n_samples + CHUNK - 1u) / CHUNK;
     var sum = vec4f(0.0);
     if ix < n {
-        for (var chunk = lane / WORDS; chunk < n_chunks; chunk += SHARES) { sum += partial_sums[chunk * n + ix]; }
+        for (var chunk = lane / WORDS; chunk < n_chunks; chunk += SHARES) { sum += partial_sums[chunk * N_SUMS + ix]; }
     }
     wg_sums[lane] = sum;
     workgroupBarrier(); // All shares are there before they are added up.

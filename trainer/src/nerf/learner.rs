@@ -85,7 +85,7 @@ pub(crate) struct Compiled {
 
 impl Compiled {
     pub(crate) fn new(gpu: &Gpu, effort: &Effort) -> Result<Self, Error> {
-        let widths = Widths::new(effort.most_levels.clamp(LEAST_LEVELS, MOST_LEVELS), effort.n_hidden, n_code());
+        let widths = Widths::new(gpu, effort.most_levels.clamp(LEAST_LEVELS, MOST_LEVELS), effort.n_hidden, n_code());
         Ok(Self { pipelines: FieldPipelines::new(gpu, &widths, effort.n_samples, OF_PICTURE)?, widths })
     }
 }
@@ -131,9 +131,15 @@ impl Learner {
         let entries: Vec<f32> = (0..n_numbers).into_par_iter().map(|ix| uniform(1, ix, FIRST_ENTRY)).collect();
         gpu.write(&self.field.grid, 0, bytemuck::cast_slice(&entries));
         let mut weights: Vec<f32> = Vec::new();
-        for ([n_in, n_out], stream) in widths.layers().into_iter().zip(2..) {
-            let most = (6.0 / f64::from(n_in + n_out)).sqrt();
-            weights.extend((0..(n_in * n_out) as usize).map(|at| uniform(stream, at, most)));
+        let layers = widths.layers().into_iter().zip(widths.used_layers());
+        for (([n_in, n_out], [used_in, used_out]), stream) in layers.zip(2..) {
+            let most = (6.0 / f64::from(used_in + used_out)).sqrt();
+            for at in 0..n_in * n_out {
+                let (row, column) = (at / n_in, at % n_in);
+                let is_used = row < used_out && column < used_in;
+                let ix = (row * used_in + column) as usize;
+                weights.push(if is_used { uniform(stream, ix, most) } else { 0.0 });
+            }
         }
         gpu.write(&self.field.weights, 0, bytemuck::cast_slice(&weights));
     }
@@ -161,6 +167,7 @@ impl Learner {
         let slot = &self.slots[slot_ix];
         let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, terms };
         let images = images.as_ref().filter(|_| learned.any());
+        passes.halve(list);
         let first_visit = if self.sizes.has_depth { FIRST_VISIT_WITH_DEPTH } else { VISIT_PERIOD };
         if step.is_multiple_of(VISIT_PERIOD) && step >= first_visit {
             passes.visit(list, occupancy, moments);
@@ -201,6 +208,7 @@ impl Learner {
         };
         let terms = of_others.as_ref().unwrap_or(&field.no_terms);
         let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0], terms };
+        passes.halve(list);
         passes.count(list, occupancy);
         passes.place(list, occupancy);
         passes.forward(list, kept);
@@ -427,6 +435,7 @@ impl Learner {
         let Self { compiled, field, occupancy, passes: list, sizes, .. } = self;
         let terms = &canvas.terms;
         let of_pixels = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, terms };
+        of_pixels.halve(list);
         for first in (0..n_pixels).step_by(slot.n_rays as usize) {
             let n = (n_pixels - first).min(slot.n_rays as usize);
             let [first_ray, n_rays] = [first, n].map(|ix| u32::try_from(ix).expect("an image's pixels"));

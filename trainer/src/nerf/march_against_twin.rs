@@ -46,7 +46,7 @@ fn rays() -> Vec<TestRay> {
 fn samples_lie_where_something_is_no_more_than_wanted() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let shape = GridShape::between(2, 4, 2, 6);
-    let widths = Widths::new(2, 4, 0);
+    let widths = Widths::new(&gpu, 2, 4, 0);
     let pipelines = FieldPipelines::new(&gpu, &widths, CAPACITY, 0).unwrap();
     let field = FieldBuffers::new(&gpu, &shape, &widths).unwrap();
     let batch = SampleBuffers::new(&gpu, CAPACITY).unwrap();

@@ -127,12 +127,21 @@ impl FieldPasses<'_> {
         list.dispatch(gpu, &pipelines.mark_blocks, groups(n_words, 64), &[("visit", visit), ("occupied", occupied)]);
     }
 
-    /// Density of every point, before the exponential.
+    /// Makes layers take the weights as they are now.
+    pub(crate) fn halve(&self, list: &mut Passes) {
+        let Self { gpu, pipelines, field, .. } = *self;
+        if let (Some(kernel), Some(half)) = (&pipelines.halve_weights, &field.half_weights) {
+            let n_groups = (half.bytes() / 16).div_ceil(64);
+            list.dispatch(gpu, kernel, n_groups, &[("weights", &field.weights), ("half_weights", half)]);
+        }
+    }
+
+    /// After [`FieldPasses::halve`]: density of every point, before the exponential.
     fn densities(&self, list: &mut Passes) {
         self.networks(list, &self.pipelines.densities, &self.field.nothing);
     }
 
-    /// Density and color of every sample, before the exponential and the sigmoid.
+    /// After [`FieldPasses::halve`]: density and color of every sample, before the exponential and the sigmoid.
     pub(crate) fn colors(&self, list: &mut Passes) {
         self.networks(list, &self.pipelines.colors, &self.field.nothing);
     }
@@ -149,7 +158,7 @@ impl FieldPasses<'_> {
             ("levels", &field.levels),
             ("points", &samples.points),
             ("grid", &field.grid),
-            ("weights", &field.weights),
+            ("weights", field.working_weights()),
             ("rays", &slot.rays),
             ("spans", &samples.spans),
             ("terms", terms),
@@ -290,7 +299,7 @@ impl FieldPasses<'_> {
             batch,
             ("levels", &field.levels),
             ("points", &samples.points),
-            ("weights", &field.weights),
+            ("weights", field.working_weights()),
             held,
             v_log_density,
             v_colors,

@@ -5,6 +5,7 @@
 // writes    v_points [n_samples] (per unit of the scene's radius)
 // twin      nerf/reference/grid.rs, nerf/reference/space.rs
 
+#import number
 #import folded
 #import ray_batch
 #import hash_grid
@@ -16,7 +17,7 @@
 @group(0) @binding(3) var<storage, read> grid: array<vec2f>;
 @group(0) @binding(4) var<storage, read> rays: array<Ray>;
 @group(0) @binding(5) var<storage, read> spans: array<Span>;
-@group(0) @binding(6) var<storage, read> v_held: array<vec4f>;
+@group(0) @binding(6) var<storage, read> v_held: array<Four>;
 @group(0) @binding(7) var<storage, read_write> v_points: array<vec4f>;
 
 // Towards the point of the unit cube.
@@ -55,7 +56,8 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     var slope = vec3f(0.0);
     for (var level = 0u; level < arrayLength(&levels); level++) {
         let first = row + 2u * level * PARTS;
-        slope += slope_in(levels[level], at, vec2f(v_held[first][sample % 4u], v_held[first + PARTS][sample % 4u]));
+        let v = vec2f(f32(v_held[first][sample % 4u]), f32(v_held[first + PARTS][sample % 4u])) / slope_scale(batch.n_rays);
+        slope += slope_in(levels[level], at, v);
     }
     let span = spans[sample];
     let ray = rays[span.ray];

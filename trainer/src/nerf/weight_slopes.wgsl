@@ -20,6 +20,9 @@ override SUM_LANES: u32;
 override CHUNK_TILES: u32;
 
 const N_LAYERS = 5u;
+const BANK = 576u;         // rows of slopes begin here: 64 strides
+
+var<workgroup> wg_rows: array<vec4f, 1152>;
 
 struct Layer {
     n_in: u32,

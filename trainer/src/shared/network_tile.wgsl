@@ -1,27 +1,23 @@
 // network_tile: where the networks of a field keep their numbers while a workgroup works on 32 samples at once.
 //
-// A row holds one number of all 32 samples, four samples a vec4. Rows lie in two banks of workgroup memory, which layers read from
-// and write to in turn. In a layer a thread works on four rows of four samples. All widths are multiples of 4.
+// A row holds one number of all 32 samples, four samples a vec4. All widths are multiples of 16.
 //
 // twin      nerf/reference/network.rs
 
 override N_FEATURES: u32;          // that go into the first network
 override N_HIDDEN: u32;            // width of all hidden layers, at most 64
 override N_COLOR_IN: u32;          // that go into the second network, at most 64
-override LANES: u32;               // of a workgroup: 2 * N_HIDDEN
+override N_COLORS: u32;            // red, green, blue, and nothing up to the 4th row, or the 16th
+override LANES: u32;               // of a workgroup
 
 const TILE = 32u;                  // samples of a workgroup
 const PARTS = 8u;                  // vec4 of a row
 const STRIDE = 9u;                 // from row to row: one vec4 of room, so that the same part of 8 rows comes from all memory banks
-const BANK = 576u;                 // rows of the other bank begin here: 64 strides
 const N_TOLD = 16u;                // that the first network tells: logarithm of the density, 15 that are handed on
 const N_HANDED_ON = 15u;
 const N_HARMONICS = 16u;
-const N_COLORS = 4u;               // red, green, blue, nothing
 
-var<workgroup> wg_rows: array<vec4f, 1152>;
-
-// A layer's weights, `[outputs, inputs]`, begin here in the vec4 of all weights.
+// A layer's weights, `[outputs, inputs]`, begin here in the vec4 of all weights, and slopes towards them in those.
 fn told_weights() -> u32 { return N_FEATURES * N_HIDDEN / 4u; }
 fn hidden_1_weights() -> u32 { return told_weights() + N_HIDDEN * N_TOLD / 4u; }
 fn hidden_2_weights() -> u32 { return hidden_1_weights() + N_COLOR_IN * N_HIDDEN / 4u; }

@@ -1,0 +1,71 @@
+// weight_slopes_half: as weight_slopes, on cooperative matrices.
+//
+// threads   256 per layer and chunk of CHUNK_TILES * 32 samples
+// reads     batch, held [n_tiles, n_held_rows, 8], v_held [n_tiles, n_slope_rows, 8]
+// writes    partial_sums [n_chunks, n_weights] (the last layer has 16 outputs)
+// twin      nerf/reference/network.rs
+//
+// A subgroup has 16 outputs and 16 inputs of the layer, over all samples of the chunk.
+
+#import number
+#import folded
+#import ray_batch
+#import network_tile
+
+@group(0) @binding(0) var<storage, read> batch: Batch;
+@group(0) @binding(1) var<storage, read> held: array<Four>;
+@group(0) @binding(2) var<storage, read> v_held: array<Four>;
+@group(0) @binding(3) var<storage, read_write> partial_sums: array<f32>;
+
+override CHUNK_TILES: u32;
+
+const N_LAYERS = 5u;
+
+struct Layer {
+    n_in: u32,
+    n_out: u32,
+    held_row: u32,
+    v_row: u32,
+    first_weight: u32,     // in vec4
+}
+
+fn layer_of(ix: u32) -> Layer {
+    switch ix {
+        case 0u: { return Layer(N_FEATURES, N_HIDDEN, 0u, 0u, 0u); }
+        case 1u: { return Layer(N_HIDDEN, N_TOLD, hidden_0_row(), v_told_row(), told_weights()); }
+        case 2u: { return Layer(N_COLOR_IN, N_HIDDEN, color_input_row(), v_hidden_1_row(), hidden_1_weights()); }
+        case 3u: { return Layer(N_HIDDEN, N_HIDDEN, hidden_1_row(), v_hidden_2_row(), hidden_2_weights()); }
+        default: { return Layer(N_HIDDEN, N_COLORS, hidden_2_row(), v_color_row(), color_weights()); }
+    }
+}
+
+@compute @workgroup_size(256)
+fn main(
+    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
+    @builtin(subgroup_id) subgroup: u32, @builtin(num_subgroups) n_subgroups: u32,
+) {
+    let ix = folded(wg, n_wgs);
+    let first_tile = ix / N_LAYERS * CHUNK_TILES;
+    let layer = layer_of(ix % N_LAYERS);
+    let n_in = layer.n_in / 16u;
+    let n_tiles = (batch.n_samples + TILE - 1u) / TILE;
+    for (var block = subgroup; block < n_in * layer.n_out / 16u; block += n_subgroups) {
+        let output = block / n_in * 16u;
+        let input = block % n_in * 16u;
+        var sums: coop_mat16x16<f32, C>;
+        for (var tile = first_tile; tile < min(first_tile + CHUNK_TILES, n_tiles); tile++) {
+            let v_at = (tile * n_slope_rows() + layer.v_row + output) * PARTS;
+            let h_at = (tile * n_held_rows() + layer.held_row + input) * PARTS;
+            for (var part = 0u; part < PARTS; part += 4u) {
+                let v = coopLoadT<coop_mat16x16<f16, A>>(&v_held[v_at + part], PARTS);
+                let h = coopLoad<coop_mat16x16<f16, B>>(&held[h_at + part], PARTS);
+                sums = coopMultiplyAdd(v, h, sums);
+            }
+        }
+        // Each has a name: naga 30 stores none that has not.
+        let total = sums * (1.0 / slope_scale(batch.n_rays));
+        let stride = layer.n_in;
+        let first = 4u * (ix / N_LAYERS * n_weight_words() + layer.first_weight) + output * stride + input;
+        coopStoreT(total, &partial_sums[first], stride);
+    }
+}

@@ -1,0 +1,24 @@
+// rows: what goes into layers and what comes out, in workgroup memory; the kernel is a function `work`.
+//
+// Rows lie in two banks, which layers read from and write to in turn. In a layer a thread works on four rows of four samples.
+
+const BANK = 576u;                 // rows of the other bank begin here: 64 strides
+
+var<workgroup> wg_rows: array<vec4f, 1152>;
+
+@compute @workgroup_size(LANES)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    work(folded(wg, n_wgs), lane);
+}
+
+fn put(bank: u32, row: u32, sample: u32, value: f32) {
+    wg_rows[bank + row * STRIDE + sample / 4u][sample % 4u] = value;
+}
+
+fn put_four(bank: u32, row: u32, part: u32, value: vec4f) { wg_rows[bank + row * STRIDE + part] = value; }
+
+// What goes into a layer.
+fn four(bank: u32, row: u32, part: u32) -> vec4f { return wg_rows[bank + row * STRIDE + part]; }
+
+// What came out of one.
+fn out_four(bank: u32, row: u32, part: u32) -> vec4f { return wg_rows[bank + row * STRIDE + part]; }
