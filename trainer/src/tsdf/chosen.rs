@@ -39,7 +39,7 @@ pub struct Lattice {
 impl Lattice {
     /// Settles what the options leave open by the first depth image; `None` where that shows nothing.
     ///
-    /// A voxel is as wide as a pixel at the median depth, no less than twice the noise there, and wide enough that what
+    /// A voxel is as wide as a pixel at the median depth, no less than the noise there, and wide enough that what
     /// this image shows takes a tenth of `max_bytes`. Noise is what is left of depth when a plane through neighbors is
     /// taken away: of `|z[-1] - 2 z[0] + z[1]|` the 90th percentile over `1.6449 sqrt(6)`. Not the median: where a sensor
     /// tells whole steps that is 0.
@@ -50,7 +50,7 @@ impl Lattice {
         let median_m = quantile(&mut depths, 5)?;
         let noise_per_m2 = usable(options.noise_per_m2).unwrap_or_else(|| noise_per_m2(options, depth));
         let px_m = median_m / (0.5 * (depth.focal_px[0] + depth.focal_px[1]));
-        let by_noise_m = 2.0 * noise_per_m2 * median_m * median_m;
+        let by_noise_m = noise_per_m2 * median_m * median_m;
         // A surface of n pixels has n (px / voxel)^2 voxels, and its band about as many blocks as a 16th of them.
         let area_m2 = n_believed as f64 * px_m * px_m;
         let by_bytes_m = options.max_bytes.map_or(0.0, |bytes| {

@@ -439,7 +439,10 @@ fn voxels_follow_the_pixels_and_the_noise() {
     let expected = 0.08 / 3.0f64.sqrt() / 4.0;
     let chosen = super::Lattice::choose(&TsdfOptions::default(), &noisy).unwrap();
     assert!((chosen.noise_per_m2 / expected - 1.0).abs() < 0.1, "{chosen:?}, expected {expected}");
-    assert!(chosen.voxel_m > 0.06 && chosen.truncation_m >= 4.0 * chosen.voxel_m - 1e-9, "{chosen:?}");
+    assert!(
+        (chosen.voxel_m / (4.0 * expected) - 1.0).abs() < 0.1 && chosen.truncation_m >= 4.0 * chosen.voxel_m - 1e-9,
+        "{chosen:?}"
+    );
     assert_eq!(depth.depth_m.len(), (SIZE_PX[0] * SIZE_PX[1]) as usize);
 }
 
