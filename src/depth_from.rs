@@ -12,6 +12,8 @@ use trainer::{DepthMap, Keyframe, Method, Picture, Split};
 
 /// A pixel that a model covers by less has the depth of nothing.
 const LEAST_ALPHA: u8 = 128;
+/// A model that shows less of what images lack is hardly of what they see.
+const LEAST_DRAWN_FRAC: f64 = 0.05;
 
 /// A saved model that depth is drawn from.
 #[derive(Clone, Debug)]
@@ -73,7 +75,12 @@ impl DepthSource {
         }
         let drawn_frac = sum.n_drawn as f64 / sum.n_missing.max(1) as f64;
         let images = print::counted(n_images as u64, "image");
-        log::info!("depth of {images} was drawn from {place}: {:.1} % of what they lacked", 100.0 * drawn_frac);
+        let told = format!("depth of {images} was drawn from {place}: {:.1} % of what they lacked", 100.0 * drawn_frac);
+        match (sum.n_missing, drawn_frac) {
+            (0, _) => log::warn!("--depth-from {place}: no image to learn from lacks depth, so it changes nothing"),
+            (_, frac) if frac < LEAST_DRAWN_FRAC => log::warn!("{told}; are both of one place, in one world frame?"),
+            _ => log::info!("{told}"),
+        }
         Ok(DrawnDepth { model: self.model.clone(), model_sha256: self.sha256.clone(), n_images, drawn_frac })
     }
 }

@@ -231,12 +231,13 @@ struct DepthError {
 }
 
 fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<DepthError> {
-    let (Some(depth), Some(drawn)) = (&keyframe.depth, draw_depth(method, keyframe)?) else {
-        return Ok(DepthError::default());
-    };
+    let Some(depth) = &keyframe.depth else { return Ok(DepthError::default()) };
+    let depth = depth.every(method.depth_stride());
+    let asked = Keyframe { depth: Some(depth.clone()), ..keyframe.clone() };
+    let Some(drawn) = draw_depth(method, &asked)? else { return Ok(DepthError::default()) };
     Ok(DepthError {
         rmse_m: depth_rmse_m(&drawn.depth_m, &depth.depth_m)?,
-        surface: surface_error(&drawn.depth_m, depth)?,
+        surface: surface_error(&drawn.depth_m, &depth)?,
     })
 }
 

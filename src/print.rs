@@ -25,7 +25,11 @@ pub(crate) fn line(text: impl Display) -> Result<(), StdoutError> {
 
 /// A count with its word: `1 image`, `2 images`.
 pub(crate) fn counted(n: u64, what: &str) -> String {
-    if n == 1 { format!("1 {what}") } else { format!("{n} {what}s") }
+    match what.strip_suffix('y') {
+        _ if n == 1 => format!("1 {what}"),
+        Some(stem) => format!("{n} {stem}ies"),
+        None => format!("{n} {what}s"),
+    }
 }
 
 /// Prints one JSON object on a line of its own.

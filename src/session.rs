@@ -192,6 +192,9 @@ pub(crate) fn finish(mut endings: Vec<Ending<impl Serialize>>) -> anyhow::Result
     for (Ending { session, out, .. }, seconds) in endings.iter_mut().zip(&ended_secs) {
         hashes.push(session.save(out, *seconds)?);
     }
+    if endings.iter().any(|ending| ending.session.stop.asked()) {
+        log::info!("saved; scoring the test images, Ctrl-C again leaves that out");
+    }
     for ((Ending { session, out, particulars }, seconds), hash) in endings.into_iter().zip(ended_secs).zip(hashes) {
         session.tell_end(&out, seconds, &hash, &particulars)?;
     }
@@ -640,10 +643,9 @@ impl Session {
         match self.tell {
             Tell::Json => print::json(&eval)?,
             Tell::Lines => print::line(format_args!(
-                "{seconds:7.2} s  step {:6}  {:8} {}s  {:7.2} ms a step  {}",
+                "{seconds:7.2} s  step {:6}  {:>15}  {:7.2} ms a step  {}",
                 eval.step,
-                eval.primitives,
-                self.method.primitive(),
+                print::counted(eval.primitives, self.method.primitive()),
                 progress.step_millis,
                 eval.scores
             ))?,

@@ -59,7 +59,8 @@ pub(crate) fn drive(
         if session.is_idle() && session.progress().step == 0 {
             let name = session.kind().name();
             return Err(LackOfEvidence(format!(
-                "no image to learn from has depth, and the scene model of the method {name} is made of depth"
+                "no image to learn from has depth, and the scene model of the method {name} is made of depth: \
+                 --depth-from gives them that of a model of the same place, and splat and nerf do without"
             ))
             .into());
         }

@@ -145,6 +145,14 @@ fn export_mesh(args: &Args) -> anyhow::Result<Exit> {
     let mesh = TsdfModel::load(super::open_gpu()?, &args.from)?.mesh()?;
     let coarser = args.cell_m.map(|cell_m| mesh.clustered(cell_m));
     let written = coarser.as_ref().unwrap_or(&mesh);
+    if let Some(cell_m) = args.cell_m
+        && written.triangles.is_empty()
+    {
+        return Err(BadArgument(format!(
+            "--cell-m {cell_m}: nothing is left of a mesh so coarse, name a smaller width"
+        ))
+        .into());
+    }
     match args.to {
         Format::Glb => write_glb(&args.out, written)?,
         _ => write_ply(&args.out, written)?,

@@ -160,6 +160,10 @@ impl<M: Renewable + 'static> Method for Aligned<M> {
         self.model.render(request)
     }
 
+    fn depth_stride(&self) -> u32 {
+        self.model.depth_stride()
+    }
+
     fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {
         let learned = self.model.learned_fix(&keyframe.camera)?;
         Ok(self.aligning.posed_lens(keyframe, learned.as_ref()))

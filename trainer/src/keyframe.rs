@@ -150,6 +150,23 @@ impl DepthMap {
         let ray = |pixel: u32, axis: usize| (f64::from(pixel) + 0.5 - self.principal_px[axis]) / self.focal_px[axis];
         Vector3::new(ray(x, 0), ray(y, 1), 1.0) * z_m
     }
+
+    /// The middle pixels of squares of `stride` by `stride`, an odd number, as an image of their own: the same readings along the same
+    /// rays. What is left over at the far edges is left out.
+    #[must_use]
+    pub fn every(&self, stride: u32) -> Self {
+        let [width, height] = self.size_px.map(|size| size / stride);
+        let at = |x: u32, y: u32| ((y * stride + stride / 2) * self.size_px[0] + x * stride + stride / 2) as usize;
+        let depth_m = (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).map(|(x, y)| self.depth_m[at(x, y)]);
+        let scaled = |along: [f64; 2]| along.map(|px| px / f64::from(stride));
+        Self {
+            size_px: [width, height],
+            focal_px: scaled(self.focal_px),
+            principal_px: scaled(self.principal_px),
+            depth_m: depth_m.collect(),
+            world_from_camera: self.world_from_camera,
+        }
+    }
 }
 
 /// The noise-free image and the true pose, from a simulator.
@@ -161,4 +178,31 @@ pub struct Truth {
     pub world_from_camera: Transform,
     /// PSNR, dB, of the keyframe's image against itself before the noise: no model can score more. `None` without noise.
     pub psnr_ceiling: Option<f64>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_third_reading_lies_where_it_lay() {
+        let size_px = [8, 7];
+        let depth_m: Vec<f32> = (0..56).map(|ix| 1.0 + ix as f32).collect();
+        let whole = DepthMap {
+            size_px,
+            focal_px: [5.0, 6.0],
+            principal_px: [3.7, 3.1],
+            depth_m: depth_m.into(),
+            world_from_camera: Transform::identity(),
+        };
+        let thin = whole.every(3);
+        assert_eq!((thin.size_px, thin.depth_m.len()), ([2, 2], 4));
+        for (x, y) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
+            let z_m = thin.depth_m[(y * 2 + x) as usize];
+            assert_eq!(z_m, whole.depth_m[((3 * y + 1) * 8 + 3 * x + 1) as usize], "{x} {y}");
+            let apart = thin.point(x, y, z_m.into()) - whole.point(3 * x + 1, 3 * y + 1, z_m.into());
+            assert!(apart.norm() < 1e-12, "{x} {y}: {apart}");
+        }
+        assert_eq!(whole.every(1).depth_m, whole.depth_m);
+    }
 }

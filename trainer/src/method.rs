@@ -63,6 +63,11 @@ pub trait Method {
     fn prepare(&mut self) -> Result<(), Error>;
     /// Draws a picture; works from the first keyframe on.
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error>;
+    /// Pixels from one to the next, along both axes, of a depth image that is drawn to be compared with a measured one: an odd number,
+    /// more than 1 where a ray is dear.
+    fn depth_stride(&self) -> u32 {
+        1
+    }
     /// The camera of a keyframe as the model has it: with what was learned about all its images, not about this one.
     fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error>;
     /// Takes one step with a timestamp around every pass; empty where the adapter has none.

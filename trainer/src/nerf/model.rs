@@ -28,6 +28,8 @@ const MOST_SUBMIT_MILLIS: f64 = 20.0;
 const BEGIN: f32 = 0.03;
 /// Cells of the occupancy become finer after one of so many of the planned steps: before a trial, which compares fields of one size.
 const FINER_AT_SHARE: u64 = 10;
+/// On a processor a picture of 640x480 takes tens of seconds before much is learned: of depth every ninth pixel tells enough.
+const SOFTWARE_DEPTH_STRIDE: u32 = 3;
 
 /// A neural field that learns from keyframes: a hash grid and two small networks, drawn along rays.
 #[derive(Debug)]
@@ -251,6 +253,10 @@ impl Renewable for NerfModel {
 }
 
 impl Method for NerfModel {
+    fn depth_stride(&self) -> u32 {
+        if self.gpu.is_software() { SOFTWARE_DEPTH_STRIDE } else { 1 }
+    }
+
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         if keyframe.split == Split::Test {
             return Ok(());
