@@ -1,7 +1,7 @@
 //! CiA 402: the drive behind a CANopen node, its state machine and its objects.
 //!
 //! Source: CiA 402-2 (IEC 61800-7-201) section "Controlling the power drive system": figure of the states, tables of
-//! controlword (`0x6040`), statusword (`0x6041`) and modes (`0x6060`); the same masks in ros-industrial/ros_canopen. Positions,
+//! controlword (`0x6040`), statusword (`0x6041`) and modes (`0x6060`); the same masks in `ros-industrial/ros_canopen`. Positions,
 //! velocities and torques are in units that each drive defines: [`Units`].
 
 use super::CanError;

@@ -1,7 +1,7 @@
 //! Damiao (DM) motors: orders, MIT commands, feedback, registers.
 //!
-//! Sources: cmjang/DM_Control_Python `DM_CAN.py` (frames, register numbers and types, limits of the models); Damiao DM-J4310-2EC
-//! manual V1.0, as told in jia-xie/python-damiao-driver `docs/concept/` (status nibble, clearing errors, registers, TIMEOUT in
+//! Sources: `cmjang/DM_Control_Python` `DM_CAN.py` (frames, register numbers and types, limits of the models); Damiao DM-J4310-2EC
+//! manual V1.0, as told in `jia-xie/python-damiao-driver` `docs/concept/` (status nibble, clearing errors, registers, TIMEOUT in
 //! ticks of 50 us). Commands go to the motor's number, registers and refresh requests to `0x7FF`; all answers come under the
 //! motor's feedback identifier (register `MST_ID`).
 

@@ -1,7 +1,7 @@
 //! MIT mode: position, velocity, two gains and a torque in the eight bytes of one frame.
 //!
-//! Source: Ben Katz, mini cheetah motor controller (`pack_cmd`, `unpack_reply`); the same bytes in cmjang/DM_Control_Python
-//! `DM_CAN.py` and neurobionics/TMotorCANControl `mit_can.py`. The drive does
+//! Source: Ben Katz, mini cheetah motor controller (`pack_cmd`, `unpack_reply`); the same bytes in `cmjang/DM_Control_Python`
+//! `DM_CAN.py` and `neurobionics/TMotorCANControl` `mit_can.py`. The drive does
 //! `torque = kp (position - measured) + kd (velocity - measured) + torque`. Values outside the limits are clamped, as there.
 
 use super::CanError;

@@ -1,6 +1,6 @@
 //! ODrive's CANSimple: six bits of node and five of command in an 11-bit identifier, little-endian numbers in the bytes.
 //!
-//! Sources: odriverobotics/ODrive `tools/odrive-cansimple.dbc` (messages since firmware 0.5); ODrive CAN protocol page and DBC of
+//! Sources: `odriverobotics/ODrive` `tools/odrive-cansimple.dbc` (messages since firmware 0.5); ODrive CAN protocol page and DBC of
 //! firmware 0.6.10 (heartbeat, errors, torques, endpoints, temperature). Turns on the wire are radians here. What a node tells
 //! comes by itself at the rates set in its `can.config` or `axis.config.can`, or when asked with a remote frame.
 

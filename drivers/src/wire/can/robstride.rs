@@ -1,6 +1,6 @@
 //! Robstride motors in their private protocol: 29-bit identifiers that carry a communication type, two numbers and flags.
 //!
-//! Sources: RobStride/SampleProgram (`Robstride.cpp`: types 0 to 25 and their bytes, active report of 10 ms); RS00 to RS06 user
+//! Sources: `RobStride/SampleProgram` (`Robstride.cpp`: types 0 to 25 and their bytes, active report of 10 ms); RS00 to RS06 user
 //! manuals (scalings, fault bits, parameter table, `canTimeout` of 20 000 counts a second, 0 for never). The scalings are those of
 //! the manuals; the table of the Python package `robstride_dynamics` differs for RS00, RS03, RS05 and RS06 and gives torques of an
 //! RS05 three times too high (motorbridge/motorbridge pull request 11). RS02 firmware up to 0.2.2.11 counts 12.5 rad as the end.

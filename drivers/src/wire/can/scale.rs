@@ -1,6 +1,6 @@
 //! The linear map between SI and unsigned counts that MIT packing and Robstride share.
 //!
-//! Source: `float_to_uint` and `uint_to_float` of Ben Katz's mini cheetah firmware, as in cmjang/DM_Control_Python: count 0 is the
+//! Source: `float_to_uint` and `uint_to_float` of Ben Katz's mini cheetah firmware, as in `cmjang/DM_Control_Python`: count 0 is the
 //! lower end, the highest count the upper. Their samples cut the fraction off; we take the nearest count, of two equally near the
 //! lower one, so that 0 in a symmetric range is sent as the same bytes as theirs.
 

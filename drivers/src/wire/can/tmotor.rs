@@ -1,6 +1,6 @@
 //! CubeMars (T-Motor) AK motors in MIT mode.
 //!
-//! Sources: neurobionics/TMotorCANControl `mit_can.py` (limits, error codes, frames); CubeMars AK Series Module Product Manual,
+//! Sources: `neurobionics/TMotorCANControl` `mit_can.py` (limits, error codes, frames); CubeMars AK Series Module Product Manual,
 //! MIT mode (feedback, temperature less 40). The limits belong to the firmware: newer ones list others for some models, so they
 //! are data and a rig may give its own.
 
