@@ -127,7 +127,7 @@ impl Pdo {
 impl Object {
     /// How it stands in a PDO's mapping: index, subindex, bits.
     pub fn mapped(self) -> u32 {
-        u32::from(self.index) << 16 | u32::from(self.subindex) << 8 | 8 * u32::from(self.n_bytes)
+        u32::from(self.index) << 16 | u32::from(self.subindex) << 8 | (8 * u32::from(self.n_bytes))
     }
 
     /// Reads an entry of a PDO's mapping; only whole bytes, 1, 2 or 4.

@@ -1,6 +1,6 @@
 //! A CAN frame as plain data, and how long the bus is busy with it.
 //!
-//! Sources: Robert Bosch GmbH, CAN Specification 2.0 (1991), parts A and B; ISO 11898-1:2015 (FD frames and their fixed stuff
+//! Sources: Robert Bosch, CAN Specification 2.0 (1991), parts A and B; ISO 11898-1:2015 (FD frames and their fixed stuff
 //! bits), field by field as in Linux's `include/linux/can/length.h`. Worst stuffing of classic frames: Davis, Burns, Bril and
 //! Lukkien 2007 (Controller Area Network schedulability analysis: refuted, revisited and revised), equation 1.
 
