@@ -1,5 +1,6 @@
 //! Byte codecs: pure `encode` and `decode`, no sockets, no clocks.
 
+pub mod can;
 pub mod datagram;
 pub mod descriptor;
 pub mod foxglove;

@@ -1,0 +1,383 @@
+//! CANopen: starting nodes, heartbeats, SYNC, expedited SDO transfers, and how objects are laid into PDOs.
+//!
+//! Source: CiA 301 (CANopen application layer and communication profile) 4.2.0: sections 7.2.2 (PDO), 7.2.4 (SDO and its abort
+//! codes), 7.2.8 (NMT, heartbeat), 7.5.2 (objects); the same bytes in christiansandberg/canopen. Transfers in segments and blocks
+//! are refused: no object that a drive needs is longer than four bytes.
+
+use super::{CanError, Frame, Id};
+
+/// How messages are called in errors.
+const SDO: &str = "SDO answer";
+const HEARTBEAT: &str = "CANopen heartbeat";
+
+/// Number of a node, 1 to 127.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Node(u8);
+
+impl Node {
+    /// A node of its number.
+    pub fn new(number: u8) -> Result<Self, CanError> {
+        match number {
+            1..=127 => Ok(Self(number)),
+            _ => Err(CanError::Range { field: "the node", value: number.into(), lower: 1.0, upper: 127.0 }),
+        }
+    }
+
+    /// Its number.
+    pub fn number(self) -> u8 {
+        self.0
+    }
+}
+
+/// What a node is told about its state.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Nmt {
+    /// Send and take PDOs.
+    Start = 0x01,
+    /// Only heartbeats and orders like this one.
+    Stop = 0x02,
+    /// SDO but no PDO.
+    EnterPreOperational = 0x80,
+    /// Begin again.
+    ResetNode = 0x81,
+    /// Begin the communication again.
+    ResetCommunication = 0x82,
+}
+
+/// What a node's heartbeat tells.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum NodeState {
+    /// It has just begun.
+    BootUp = 0x00,
+    /// Only heartbeats.
+    Stopped = 0x04,
+    /// It sends and takes PDOs.
+    Operational = 0x05,
+    /// SDO but no PDO.
+    PreOperational = 0x7F,
+}
+
+/// An entry of the object dictionary.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Object {
+    /// Index.
+    pub index: u16,
+    /// Subindex.
+    pub subindex: u8,
+    /// Bytes of its value: 1, 2 or 4.
+    pub n_bytes: u8,
+}
+
+/// Consumer heartbeat time, entry 1: node in bits 16 to 22, milliseconds below; what makes a drive stop when the host is gone.
+pub const CONSUMER_HEARTBEAT: Object = Object { index: 0x1016, subindex: 1, n_bytes: 4 };
+/// Producer heartbeat time, milliseconds; 0 is none.
+pub const PRODUCER_HEARTBEAT: Object = Object { index: 0x1017, subindex: 0, n_bytes: 2 };
+
+/// Which of a node's four pairs of PDOs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+#[expect(missing_docs, reason = "they are numbers")]
+pub enum Pdo {
+    First = 0,
+    Second = 1,
+    Third = 2,
+    Fourth = 3,
+}
+
+/// Which way a PDO goes, seen from the node.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Direction {
+    /// To the node.
+    Receive,
+    /// From the node.
+    Transmit,
+}
+
+impl Pdo {
+    /// Identifier as CiA 301 gives it out at first.
+    pub fn id(self, direction: Direction, node: Node) -> Id {
+        let base = match direction {
+            Direction::Receive => 0x200,
+            Direction::Transmit => 0x180,
+        };
+        Id::standard(base + 0x100 * u32::from(self as u8) + u32::from(node.0)).expect("at most 0x57F")
+    }
+
+    /// The object that says what is in it, entry `place` from 1; entry 0 is how many there are.
+    pub fn mapping(self, direction: Direction, place: u8) -> Object {
+        let base = match direction {
+            Direction::Receive => 0x1600,
+            Direction::Transmit => 0x1A00,
+        };
+        Object { index: base + self as u16, subindex: place, n_bytes: if place == 0 { 1 } else { 4 } }
+    }
+
+    /// The object that says how it is sent: entry 1 its identifier (bit 31 switches it off), entry 2 when.
+    pub fn communication(self, direction: Direction, entry: u8) -> Object {
+        let base = match direction {
+            Direction::Receive => 0x1400,
+            Direction::Transmit => 0x1800,
+        };
+        Object { index: base + self as u16, subindex: entry, n_bytes: if entry == 1 { 4 } else { 1 } }
+    }
+}
+
+impl Object {
+    /// How it stands in a PDO's mapping: index, subindex, bits.
+    pub fn mapped(self) -> u32 {
+        u32::from(self.index) << 16 | u32::from(self.subindex) << 8 | (8 * u32::from(self.n_bytes))
+    }
+
+    /// Reads an entry of a PDO's mapping; only whole bytes, 1, 2 or 4.
+    pub fn from_mapped(entry: u32) -> Result<Self, CanError> {
+        let [high, low, subindex, n_bits] = entry.to_be_bytes();
+        match n_bits {
+            8 | 16 | 32 => Ok(Self { index: u16::from_be_bytes([high, low]), subindex, n_bytes: n_bits / 8 }),
+            _ => Err(CanError::Undefined { field: "the length of a mapped object in bits", raw: n_bits.into() }),
+        }
+    }
+}
+
+/// The value of [`CONSUMER_HEARTBEAT`]: the drive misses `host` after so many milliseconds without a heartbeat of it; 0 never.
+pub fn consumer_heartbeat(host: Node, millis: u16) -> u32 {
+    u32::from(host.0) << 16 | u32::from(millis)
+}
+
+/// An order about the state of a node, or of all.
+pub fn encode_nmt(order: Nmt, node: Option<Node>) -> Frame {
+    made(0, &[order as u8, node.map_or(0, Node::number)])
+}
+
+/// The beat at which nodes send and take their cyclic PDOs.
+pub fn encode_sync() -> Frame {
+    made(0x80, &[])
+}
+
+/// A heartbeat: the host's own, so that drives stop without it, or that of a simulated node.
+pub fn encode_heartbeat(node: Node, state: NodeState) -> Frame {
+    made(0x700 + u32::from(node.0), &[state as u8])
+}
+
+/// Reads a heartbeat.
+pub fn decode_heartbeat(frame: &Frame) -> Result<(Node, NodeState), CanError> {
+    let (node, bytes) = from_node(frame, 0x700, HEARTBEAT)?;
+    let &[state] = bytes else {
+        return Err(CanError::Length { message: HEARTBEAT, got_bytes: bytes.len(), expected_bytes: 1 });
+    };
+    let all = [NodeState::BootUp, NodeState::Stopped, NodeState::Operational, NodeState::PreOperational];
+    let found = all.into_iter().find(|known| *known as u8 == state);
+    Ok((node, found.ok_or(CanError::Undefined { field: "the state of the node", raw: state.into() })?))
+}
+
+/// Asks a node for an object.
+pub fn encode_read(node: Node, object: Object) -> Frame {
+    let [low, high] = object.index.to_le_bytes();
+    made(0x600 + u32::from(node.0), &[0x40, low, high, object.subindex, 0, 0, 0, 0])
+}
+
+/// Sets an object of a node; a value that has more bytes than the object is refused. Negative values go as two's complement.
+pub fn encode_write(node: Node, object: Object, value: i64) -> Result<Frame, CanError> {
+    let n_bits = 8 * u32::from(object.n_bytes);
+    let command = match object.n_bytes {
+        1 => 0x2F,
+        2 => 0x2B,
+        4 => 0x23,
+        n_bytes => return Err(CanError::Undefined { field: "the bytes of an object", raw: n_bytes.into() }),
+    };
+    let (lower, upper) = (-(1_i64 << (n_bits - 1)), (1_i64 << n_bits) - 1);
+    if !(lower..=upper).contains(&value) {
+        #[expect(clippy::cast_precision_loss, reason = "only told")]
+        let [value, lower, upper] = [value, lower, upper].map(|number| number as f64);
+        return Err(CanError::Range { field: "the value of an object", value, lower, upper });
+    }
+    let [low, high] = object.index.to_le_bytes();
+    let mut bytes = [command, low, high, object.subindex, 0, 0, 0, 0];
+    let n_bytes = usize::from(object.n_bytes);
+    bytes[4..4 + n_bytes].copy_from_slice(&value.to_le_bytes()[..n_bytes]);
+    Ok(made(0x600 + u32::from(node.0), &bytes))
+}
+
+/// What a node answers about an object.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SdoAnswer {
+    /// It is set.
+    Written {
+        /// Index of the object.
+        index: u16,
+        /// Subindex of the object.
+        subindex: u8,
+    },
+    /// What it holds; `n_bytes` is 4 where the node does not tell.
+    Value {
+        /// The object, with the length that the node tells.
+        object: Object,
+        /// Its bytes, the upper ones 0; [`signed`] for those that may be negative.
+        raw: u32,
+    },
+}
+
+/// The number of a two's complement of so many bytes: 1, 2 or 4.
+pub fn signed(raw: u32, n_bytes: u8) -> i32 {
+    let unused = 32 - 8 * u32::from(n_bytes.clamp(1, 4));
+    (raw << unused).cast_signed() >> unused
+}
+
+/// Reads a node's answer about an object; a transfer that the node broke off or wants to do in segments is an error.
+pub fn decode_sdo(frame: &Frame) -> Result<(Node, SdoAnswer), CanError> {
+    let (node, bytes) = from_node(frame, 0x580, SDO)?;
+    let &[command, low, high, subindex, a, b, c, d] = bytes else {
+        return Err(CanError::Length { message: SDO, got_bytes: bytes.len(), expected_bytes: 8 });
+    };
+    let index = u16::from_le_bytes([low, high]);
+    let value = u32::from_le_bytes([a, b, c, d]);
+    // The upper three bits say what it is; then, in answers to a read: bytes unused, expedited, length told.
+    match (command >> 5, command & 0b10 != 0, command & 0b01 != 0) {
+        (3, ..) => Ok((node, SdoAnswer::Written { index, subindex })),
+        (4, ..) => Err(CanError::Aborted { index, subindex, code: value }),
+        (2, true, is_told) => {
+            let n_bytes = if is_told { 4 - (command >> 2 & 0b11) } else { 4 };
+            let raw = value & (u32::MAX >> (32 - 8 * u32::from(n_bytes)));
+            Ok((node, SdoAnswer::Value { object: Object { index, subindex, n_bytes }, raw }))
+        }
+        (2, false, _) | (0 | 1 | 6, ..) => Err(CanError::Segmented { index, subindex }),
+        _ => Err(CanError::Undefined { field: "the command of an SDO answer", raw: command.into() }),
+    }
+}
+
+/// What an abort code means.
+pub fn abort_text(code: u32) -> &'static str {
+    match code {
+        0x0503_0000 => "toggle bit not alternated",
+        0x0504_0000 => "timed out",
+        0x0504_0001 => "command unknown",
+        0x0504_0005 => "out of memory",
+        0x0601_0000 => "access not supported",
+        0x0601_0001 => "write only",
+        0x0601_0002 => "read only",
+        0x0602_0000 => "no such object",
+        0x0604_0041 => "cannot be mapped to a PDO",
+        0x0604_0042 => "mapped objects exceed the PDO",
+        0x0604_0043 => "parameters incompatible",
+        0x0604_0047 => "internal incompatibility",
+        0x0606_0000 => "hardware error",
+        0x0607_0010 => "length does not match",
+        0x0607_0012 => "too long",
+        0x0607_0013 => "too short",
+        0x0609_0011 => "no such subindex",
+        0x0609_0030 => "value out of range",
+        0x0609_0031 => "value too high",
+        0x0609_0032 => "value too low",
+        0x0800_0000 => "general error",
+        0x0800_0020 => "cannot be stored",
+        0x0800_0021 => "cannot be stored: local control",
+        0x0800_0022 => "cannot be stored in the present state",
+        _ => "unknown code",
+    }
+}
+
+fn made(id: u32, bytes: &[u8]) -> Frame {
+    let id = Id::standard(id).expect("at most 0x700 and 127");
+    Frame::classic(id, bytes).expect("at most eight bytes")
+}
+
+/// The node and the bytes of a data frame whose identifier is `base` and a node.
+fn from_node<'a>(frame: &'a Frame, base: u32, message: &'static str) -> Result<(Node, &'a [u8]), CanError> {
+    let id = frame.id().value();
+    let node = id.checked_sub(base).and_then(|number| Node::new(u8::try_from(number).ok()?).ok());
+    match node {
+        Some(node) if !frame.is_remote() && !frame.is_fd() && !frame.id().is_extended() => Ok((node, frame.data())),
+        _ => Err(CanError::Foreign { message, id }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::{cut_and_doubled, random_frames};
+    use super::*;
+
+    const NODE: Node = Node(5);
+    const TARGET: Object = Object { index: 0x607A, subindex: 0, n_bytes: 4 };
+
+    #[test]
+    fn what_is_sent_is_the_published_bytes() {
+        assert_eq!(encode_nmt(Nmt::Start, None), made(0, &[1, 0]));
+        assert_eq!(encode_nmt(Nmt::ResetNode, Some(NODE)), made(0, &[0x81, 5]));
+        assert_eq!(encode_sync(), made(0x80, &[]));
+        assert_eq!(encode_heartbeat(Node(127), NodeState::Operational), made(0x77F, &[5]));
+        // christiansandberg/canopen, test_sdo: expedited upload of 0x1018:01 and download of 0x1017.
+        let vendor = Object { index: 0x1018, subindex: 1, n_bytes: 4 };
+        assert_eq!(encode_read(Node(2), vendor), made(0x602, &[0x40, 0x18, 0x10, 0x01, 0, 0, 0, 0]));
+        assert_eq!(
+            encode_write(Node(2), PRODUCER_HEARTBEAT, 4000),
+            Ok(made(0x602, &[0x2B, 0x17, 0x10, 0, 0xA0, 0x0F, 0, 0]))
+        );
+        let mode = Object { index: 0x6060, subindex: 0, n_bytes: 1 };
+        assert_eq!(encode_write(NODE, mode, -1), Ok(made(0x605, &[0x2F, 0x60, 0x60, 0, 0xFF, 0, 0, 0])));
+        assert_eq!(encode_write(NODE, TARGET, -2), Ok(made(0x605, &[0x23, 0x7A, 0x60, 0, 0xFE, 0xFF, 0xFF, 0xFF])));
+        assert_eq!(consumer_heartbeat(Node(127), 100), 0x007F_0064);
+        assert_eq!(TARGET.mapped(), 0x607A_0020);
+    }
+
+    #[test]
+    fn pdos_have_their_identifiers_and_objects() {
+        let ids =
+            |direction| [Pdo::First, Pdo::Second, Pdo::Third, Pdo::Fourth].map(|pdo| pdo.id(direction, NODE).value());
+        assert_eq!(ids(Direction::Transmit), [0x185, 0x285, 0x385, 0x485]);
+        assert_eq!(ids(Direction::Receive), [0x205, 0x305, 0x405, 0x505]);
+        assert_eq!(Pdo::First.mapping(Direction::Receive, 0), Object { index: 0x1600, subindex: 0, n_bytes: 1 });
+        assert_eq!(Pdo::Second.mapping(Direction::Transmit, 2), Object { index: 0x1A01, subindex: 2, n_bytes: 4 });
+        assert_eq!(Pdo::Third.communication(Direction::Transmit, 1), Object { index: 0x1802, subindex: 1, n_bytes: 4 });
+        assert_eq!(Pdo::Fourth.communication(Direction::Receive, 2), Object { index: 0x1403, subindex: 2, n_bytes: 1 });
+        assert_eq!(Object::from_mapped(0x607A_0020), Ok(TARGET));
+        assert!(Object::from_mapped(0x607A_0021).is_err());
+    }
+
+    #[test]
+    fn answers_are_read() {
+        let read = |bytes: &[u8]| decode_sdo(&made(0x585, bytes)).map(|(_, answer)| answer);
+        let value = |n_bytes, raw| SdoAnswer::Value { object: Object { index: 0x6064, subindex: 0, n_bytes }, raw };
+        assert_eq!(read(&[0x43, 0x64, 0x60, 0, 1, 2, 3, 4]), Ok(value(4, 0x0403_0201)));
+        assert_eq!(read(&[0x4B, 0x64, 0x60, 0, 0xFE, 0xFF, 9, 9]), Ok(value(2, 0xFFFE)));
+        assert_eq!(read(&[0x4F, 0x64, 0x60, 0, 7, 9, 9, 9]), Ok(value(1, 7)));
+        assert_eq!(read(&[0x42, 0x64, 0x60, 0, 1, 0, 0, 0]), Ok(value(4, 1)));
+        assert_eq!(read(&[0x60, 0x7A, 0x60, 0, 0, 0, 0, 0]), Ok(SdoAnswer::Written { index: 0x607A, subindex: 0 }));
+        // christiansandberg/canopen, test_abort.
+        let aborted = read(&[0x80, 0x18, 0x10, 0x01, 0x11, 0x00, 0x09, 0x06]);
+        assert_eq!(aborted, Err(CanError::Aborted { index: 0x1018, subindex: 1, code: 0x0609_0011 }));
+        assert!(aborted.expect_err("aborted").to_string().ends_with("0x06090011 (no such subindex)"));
+        let name = read(&[0x41, 0x08, 0x10, 0, 0x1A, 0, 0, 0]);
+        assert_eq!(name, Err(CanError::Segmented { index: 0x1008, subindex: 0 }));
+        assert!(name.expect_err("segmented").to_string().contains("0x1008:00 comes in segments"));
+        let states = [NodeState::BootUp, NodeState::Stopped, NodeState::Operational, NodeState::PreOperational];
+        for state in states {
+            assert_eq!(decode_heartbeat(&encode_heartbeat(NODE, state)), Ok((NODE, state)));
+        }
+        assert_eq!([signed(0xFFFE, 2), signed(0x7FFE, 2), signed(0xFF, 1), signed(u32::MAX, 4)], [-2, 0x7FFE, -1, -1]);
+    }
+
+    #[test]
+    fn what_is_amiss_is_refused() {
+        for number in [0, 128, 255] {
+            assert!(Node::new(number).is_err());
+        }
+        for (object, value) in [(PRODUCER_HEARTBEAT, 65_536), (PRODUCER_HEARTBEAT, -32_769), (TARGET, 1 << 32)] {
+            assert!(matches!(encode_write(NODE, object, value), Err(CanError::Range { .. })), "{value}");
+        }
+        assert!(encode_write(NODE, Object { n_bytes: 8, ..TARGET }, 0).is_err());
+        for bent in cut_and_doubled(&made(0x585, &[0x43, 0x64, 0x60, 0, 1, 2, 3, 4])) {
+            assert!(decode_sdo(&bent).is_err(), "{bent:?}");
+        }
+        for (id, bytes) in [(0x705, &[][..]), (0x705, &[5, 5]), (0x705, &[6]), (0x700, &[5]), (0x6FF, &[5])] {
+            assert!(decode_heartbeat(&made(id, bytes)).is_err(), "{id:x} {bytes:?}");
+        }
+        assert!(matches!(decode_sdo(&made(0x605, &[0x43; 8])), Err(CanError::Foreign { .. })));
+        let mut n_read = 0;
+        for frame in random_frames(29, Id::standard(0x585).expect("11 bits")) {
+            n_read += i32::from(decode_sdo(&frame).is_ok());
+            let _ = decode_heartbeat(&frame);
+        }
+        assert!(n_read > 100, "{n_read}");
+    }
+}

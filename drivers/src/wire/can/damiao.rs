@@ -1,0 +1,399 @@
+//! Damiao (DM) motors: orders, MIT commands, feedback, registers.
+//!
+//! Sources: `cmjang/DM_Control_Python` `DM_CAN.py` (frames, register numbers and types, limits of the models); Damiao DM-J4310-2EC
+//! manual V1.0, as told in `jia-xie/python-damiao-driver` `docs/concept/` (status nibble, clearing errors, registers, TIMEOUT in
+//! ticks of 50 us). Commands go to the motor's number, registers and refresh requests to `0x7FF`; all answers come under the
+//! motor's feedback identifier (register `MST_ID`).
+
+use super::mit::{self, Command, Limits, Motion};
+use super::{CanError, Frame, Id, eight};
+
+/// Identifier of what is about registers.
+const REGISTER_ID: u32 = 0x7FF;
+/// Seconds of one count of register `TIMEOUT`.
+const TIMEOUT_TICK_SECS: f64 = 50e-6;
+/// How messages that come from a motor are called in errors.
+const FEEDBACK: &str = "feedback of a Damiao motor";
+const REGISTER: &str = "register message of a Damiao motor";
+
+/// A model whose limits are known as the maker ships them; registers `PMAX`, `VMAX` and `TMAX` hold what is true.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[expect(missing_docs, reason = "they are the names on the motors")]
+pub enum Model {
+    Dm4310,
+    Dm4310At48V,
+    Dm4340,
+    Dm4340At48V,
+    Dm6006,
+    Dm8006,
+    Dm8009,
+    Dm10010L,
+    Dm10010,
+    DmH3510,
+    DmG6215,
+    DmH6220,
+}
+
+impl Model {
+    /// What its counts cover as it is shipped.
+    pub const fn limits(self) -> Limits {
+        match self {
+            Self::Dm4310 => Limits::of(12.5, 30.0, 10.0),
+            Self::Dm4310At48V => Limits::of(12.5, 50.0, 10.0),
+            Self::Dm4340 => Limits::of(12.5, 8.0, 28.0),
+            Self::Dm4340At48V => Limits::of(12.5, 10.0, 28.0),
+            Self::Dm6006 => Limits::of(12.5, 45.0, 20.0),
+            Self::Dm8006 => Limits::of(12.5, 45.0, 40.0),
+            Self::Dm8009 => Limits::of(12.5, 45.0, 54.0),
+            Self::Dm10010L => Limits::of(12.5, 25.0, 200.0),
+            Self::Dm10010 => Limits::of(12.5, 20.0, 200.0),
+            Self::DmH3510 => Limits::of(12.5, 280.0, 1.0),
+            Self::DmG6215 | Self::DmH6220 => Limits::of(12.5, 45.0, 10.0),
+        }
+    }
+}
+
+/// An order without numbers: seven bytes `FF` and this one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Order {
+    /// Forget the error that stopped the motor.
+    ClearError = 0xFB,
+    /// Obey commands from now on.
+    Enable = 0xFC,
+    /// Let the shaft go.
+    Disable = 0xFD,
+    /// Take the present position as zero.
+    SetZero = 0xFE,
+}
+
+/// The upper half of a feedback's first byte.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Status {
+    /// The shaft is free.
+    Disabled = 0x0,
+    /// It obeys.
+    Enabled = 0x1,
+    /// Stopped: supply too high.
+    OverVoltage = 0x8,
+    /// Stopped: supply too low.
+    UnderVoltage = 0x9,
+    /// Stopped: too much current.
+    OverCurrent = 0xA,
+    /// Stopped: the drive is too hot.
+    DriveOverTemperature = 0xB,
+    /// Stopped: the windings are too hot.
+    RotorOverTemperature = 0xC,
+    /// Stopped: nothing came for longer than register `TIMEOUT`.
+    LostCommunication = 0xD,
+    /// Stopped: overloaded.
+    Overload = 0xE,
+}
+
+impl Status {
+    const ALL: [Self; 9] = [
+        Self::Disabled,
+        Self::Enabled,
+        Self::OverVoltage,
+        Self::UnderVoltage,
+        Self::OverCurrent,
+        Self::DriveOverTemperature,
+        Self::RotorOverTemperature,
+        Self::LostCommunication,
+        Self::Overload,
+    ];
+}
+
+/// What a motor answers to every command, order and refresh request.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Feedback {
+    /// The lower four bits of the motor's number.
+    pub motor_low: u8,
+    /// How it is.
+    pub status: Status,
+    /// What it does.
+    pub motion: Motion,
+    /// Of the power stage, whole degrees Celsius.
+    pub drive_celsius: u8,
+    /// Of the windings, whole degrees Celsius.
+    pub rotor_celsius: u8,
+}
+
+/// A register that this program reads or writes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Register {
+    /// Identifier of the motor's answers.
+    FeedbackId = 7,
+    /// Number of the motor.
+    MotorId = 8,
+    /// How long the motor obeys its last command when none follows, ticks of 50 us; 0 is for ever.
+    Timeout = 9,
+    /// 1 is MIT mode.
+    ControlMode = 10,
+    /// Version of the firmware.
+    SoftwareVersion = 14,
+    /// `PMAX`: the ends of the position's counts, rad.
+    PositionLimit = 21,
+    /// `VMAX`: the ends of the velocity's counts, rad/s.
+    VelocityLimit = 22,
+    /// `TMAX`: the ends of the torque's counts, N m.
+    TorqueLimit = 23,
+    /// Code of the bit rate.
+    BitRate = 35,
+}
+
+impl Register {
+    const ALL: [Self; 9] = [
+        Self::FeedbackId,
+        Self::MotorId,
+        Self::Timeout,
+        Self::ControlMode,
+        Self::SoftwareVersion,
+        Self::PositionLimit,
+        Self::VelocityLimit,
+        Self::TorqueLimit,
+        Self::BitRate,
+    ];
+
+    fn is_whole(self) -> bool {
+        !matches!(self, Self::PositionLimit | Self::VelocityLimit | Self::TorqueLimit)
+    }
+}
+
+/// What a register holds.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Value {
+    /// In registers of numbers, codes and ticks.
+    Whole(u32),
+    /// In registers of SI values.
+    Real(f32),
+}
+
+/// A message about registers, to the motor or its answer.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RegisterMessage {
+    /// Number of the motor it goes to or comes from.
+    pub motor: u16,
+    /// What it does.
+    pub access: Access,
+}
+
+/// What a message about registers does.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Access {
+    /// Asks for a register; the answer is [`Access::Told`].
+    Read(Register),
+    /// Writes a register until the power goes; the answer repeats it.
+    Write(Register, Value),
+    /// The answer to [`Access::Read`].
+    Told(Register, Value),
+    /// Keeps all registers over a loss of power; only while disabled.
+    Store,
+    /// Asks for feedback without a command.
+    Refresh,
+}
+
+/// The count of register `TIMEOUT` for a time, rounded up so that no motor stops earlier than asked for; 0 never stops it.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within u32 by the check")]
+pub fn timeout_ticks(timeout_secs: f64) -> Result<u32, CanError> {
+    let upper = f64::from(u32::MAX) * TIMEOUT_TICK_SECS;
+    match (0.0..=upper).contains(&timeout_secs) {
+        true if timeout_secs == 0.0 => Ok(0),
+        // Less a hair, so that whole ticks stay what they are; never 0, which would be for ever.
+        true => Ok((timeout_secs / TIMEOUT_TICK_SECS - 1e-6).ceil().max(1.0) as u32),
+        false => Err(CanError::Range { field: "the timeout in seconds", value: timeout_secs, lower: 0.0, upper }),
+    }
+}
+
+/// The time that a count of register `TIMEOUT` stands for, seconds.
+pub fn timeout_secs(ticks: u32) -> f64 {
+    f64::from(ticks) * TIMEOUT_TICK_SECS
+}
+
+/// What the counts of a motor cover by its registers `PMAX`, `VMAX` and `TMAX`; all must be above zero.
+pub fn limits_from_registers(p_max: f32, v_max: f32, t_max: f32) -> Result<Limits, CanError> {
+    for (field, most) in [("PMAX", p_max), ("VMAX", v_max), ("TMAX", t_max)] {
+        if !(most > 0.0 && most.is_finite()) {
+            return Err(CanError::Range { field, value: most.into(), lower: 0.0, upper: f32::MAX.into() });
+        }
+    }
+    Ok(Limits::of(p_max.into(), v_max.into(), t_max.into()))
+}
+
+/// The frame of a command in MIT mode; values outside the limits are clamped.
+pub fn encode_command(motor: u16, command: &Command, limits: &Limits) -> Result<Frame, CanError> {
+    Frame::classic(Id::standard(motor.into())?, &mit::encode(command, limits)?)
+}
+
+/// The frame of an order.
+pub fn encode_order(motor: u16, order: Order) -> Result<Frame, CanError> {
+    Frame::classic(Id::standard(motor.into())?, &[0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, order as u8])
+}
+
+/// The frame of a message about registers, as it goes to a motor; an answer bears the motor's feedback identifier instead.
+pub fn encode_register(message: &RegisterMessage, answer_id: Option<Id>) -> Result<Frame, CanError> {
+    let (code, register, value) = match message.access {
+        Access::Read(register) => (0x33, register as u8, [0; 4]),
+        Access::Write(register, value) => (0x55, register as u8, value_bytes(register, value)?),
+        Access::Told(register, value) => (0x33, register as u8, value_bytes(register, value)?),
+        Access::Store => (0xAA, 0, [0; 4]),
+        Access::Refresh => (0xCC, 0, [0; 4]),
+    };
+    let [low, high] = u16::try_from(Id::standard(message.motor.into())?.value()).expect("11 bits").to_le_bytes();
+    let [a, b, c, d] = value;
+    Frame::classic(answer_id.map_or_else(|| Id::standard(REGISTER_ID), Ok)?, &[low, high, code, register, a, b, c, d])
+}
+
+/// Reads a motor's answer about a register.
+pub fn decode_register(frame: &Frame) -> Result<RegisterMessage, CanError> {
+    let [low, high, code, number, a, b, c, d] = eight(frame, REGISTER, false)?;
+    let undefined = |field, raw: u8| CanError::Undefined { field, raw: raw.into() };
+    let register = || {
+        let found = Register::ALL.into_iter().find(|register| *register as u8 == number);
+        found.ok_or_else(|| undefined("the register", number))
+    };
+    let value = |register: Register| match register.is_whole() {
+        true => Value::Whole(u32::from_le_bytes([a, b, c, d])),
+        false => Value::Real(f32::from_le_bytes([a, b, c, d])),
+    };
+    let access = match code {
+        0x33 => register().map(|register| Access::Told(register, value(register)))?,
+        0x55 => register().map(|register| Access::Write(register, value(register)))?,
+        other => return Err(undefined("the kind of access", other)),
+    };
+    Ok(RegisterMessage { motor: u16::from_le_bytes([low, high]), access })
+}
+
+/// Reads a motor's feedback. An answer about a register comes under the same identifier: the caller knows whether it asked.
+pub fn decode_feedback(frame: &Frame, limits: &Limits) -> Result<Feedback, CanError> {
+    let [head, a, b, c, d, e, drive_celsius, rotor_celsius] = eight(frame, FEEDBACK, false)?;
+    let status = Status::ALL.into_iter().find(|status| *status as u8 == head >> 4);
+    Ok(Feedback {
+        motor_low: head & 0xF,
+        status: status.ok_or(CanError::Undefined { field: "the status", raw: (head >> 4).into() })?,
+        motion: mit::decode_motion([a, b, c, d, e], limits),
+        drive_celsius,
+        rotor_celsius,
+    })
+}
+
+/// A motor's feedback, for motors that are simulated.
+pub fn encode_feedback(answer_id: Id, feedback: &Feedback, limits: &Limits) -> Result<Frame, CanError> {
+    let [a, b, c, d, e] = mit::encode_motion(&feedback.motion, limits)?;
+    let head = (feedback.status as u8) << 4 | (feedback.motor_low & 0xF);
+    Frame::classic(answer_id, &[head, a, b, c, d, e, feedback.drive_celsius, feedback.rotor_celsius])
+}
+
+fn value_bytes(register: Register, value: Value) -> Result<[u8; 4], CanError> {
+    match (register.is_whole(), value) {
+        (true, Value::Whole(whole)) => Ok(whole.to_le_bytes()),
+        (false, Value::Real(real)) if real.is_finite() => Ok(real.to_le_bytes()),
+        _ => Err(CanError::Undefined { field: "the kind of value of the register", raw: register as u32 }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::{cut_and_doubled, random_frames};
+    use super::*;
+
+    const LIMITS: Limits = Model::Dm4310.limits();
+
+    fn answer(bytes: [u8; 8]) -> Frame {
+        Frame::classic(Id::standard(0x11).expect("small"), &bytes).expect("classic")
+    }
+
+    #[test]
+    fn what_goes_to_a_motor_is_the_makers_bytes() {
+        let sent = |access| encode_register(&RegisterMessage { motor: 0x101, access }, None).expect("a message");
+        let timeout = Value::Whole(timeout_ticks(1.0).expect("in range"));
+        for (access, bytes) in [
+            (Access::Read(Register::PositionLimit), [0x01, 0x01, 0x33, 21, 0, 0, 0, 0]),
+            (Access::Write(Register::ControlMode, Value::Whole(1)), [0x01, 0x01, 0x55, 10, 1, 0, 0, 0]),
+            (Access::Write(Register::PositionLimit, Value::Real(12.5)), [0x01, 0x01, 0x55, 21, 0, 0, 0x48, 0x41]),
+            (Access::Write(Register::Timeout, timeout), [0x01, 0x01, 0x55, 9, 0x20, 0x4E, 0, 0]),
+            (Access::Store, [0x01, 0x01, 0xAA, 0, 0, 0, 0, 0]),
+            (Access::Refresh, [0x01, 0x01, 0xCC, 0, 0, 0, 0, 0]),
+        ] {
+            assert_eq!((sent(access).id().value(), sent(access).data()), (0x7FF, &bytes[..]), "{access:?}");
+        }
+        for (order, last) in
+            [(Order::ClearError, 0xFB), (Order::Enable, 0xFC), (Order::Disable, 0xFD), (Order::SetZero, 0xFE)]
+        {
+            let frame = encode_order(1, order).expect("a motor");
+            assert_eq!((frame.id().value(), frame.data()), (1, &[255, 255, 255, 255, 255, 255, 255, last][..]));
+        }
+        let still = encode_command(1, &Command::default(), &LIMITS).expect("numbers");
+        assert_eq!(still.data(), [0x7F, 0xFF, 0x7F, 0xF0, 0, 0, 0x07, 0xFF]);
+        assert_eq!(encode_order(0x800, Order::Enable), Err(CanError::IdRange { id: 0x800, bits: 11 }));
+    }
+
+    #[test]
+    fn feedback_and_registers_are_read_and_made_again() {
+        let frame = answer([0x11, 0xFF, 0xFF, 0x00, 0x0F, 0xFF, 31, 28]);
+        let feedback = decode_feedback(&frame, &LIMITS).expect("feedback");
+        let motion = Motion { position_rad: 12.5, velocity_rad_s: -30.0, torque_nm: 10.0 };
+        let expected = Feedback { motor_low: 1, status: Status::Enabled, motion, drive_celsius: 31, rotor_celsius: 28 };
+        assert_eq!(feedback, expected);
+        assert_eq!(encode_feedback(frame.id(), &feedback, &LIMITS), Ok(frame));
+
+        let told = answer([0x01, 0x00, 0x33, 22, 0, 0, 0xF0, 0x41]);
+        let message = decode_register(&told).expect("a register");
+        let access = Access::Told(Register::VelocityLimit, Value::Real(30.0));
+        assert_eq!(message, RegisterMessage { motor: 1, access });
+        assert_eq!(encode_register(&message, Some(told.id())), Ok(told));
+        assert_eq!(limits_from_registers(12.5, 30.0, 10.0), Ok(LIMITS));
+    }
+
+    #[test]
+    fn a_timeout_is_ticks_of_50_us() {
+        for (secs, ticks) in [(0.0, 0), (50e-6, 1), (0.02, 400), (0.4, 8000), (1.0, 20_000), (51e-6, 2), (1e-12, 1)] {
+            assert_eq!(timeout_ticks(secs), Ok(ticks), "{secs}");
+        }
+        assert!((timeout_secs(8000) - 0.4).abs() < 1e-12);
+        for secs in [-1e-3, f64::NAN, f64::INFINITY, 1e9] {
+            assert!(matches!(timeout_ticks(secs), Err(CanError::Range { .. })), "{secs}");
+        }
+    }
+
+    #[test]
+    fn what_is_amiss_is_refused() {
+        for status in [0x2, 0x7, 0xF] {
+            let undefined = CanError::Undefined { field: "the status", raw: status };
+            let head = u8::try_from(status << 4 | 1).expect("a byte");
+            assert_eq!(decode_feedback(&answer([head, 0, 0, 0, 0, 0, 0, 0]), &LIMITS), Err(undefined));
+        }
+        for (bytes, field) in
+            [([1, 0, 0x33, 99, 0, 0, 0, 0], "the register"), ([1, 0, 0x34, 9, 0, 0, 0, 0], "the kind of access")]
+        {
+            assert!(matches!(decode_register(&answer(bytes)), Err(CanError::Undefined { field: f, .. }) if f == field));
+        }
+        let whole = answer([0x11, 0x80, 0, 0x80, 0x08, 0, 30, 30]);
+        for bent in cut_and_doubled(&whole) {
+            assert!(matches!(decode_feedback(&bent, &LIMITS), Err(CanError::Length { .. })));
+            assert!(matches!(decode_register(&bent), Err(CanError::Length { .. })));
+        }
+        let mixed = RegisterMessage { motor: 1, access: Access::Write(Register::Timeout, Value::Real(1.0)) };
+        assert!(encode_register(&mixed, None).is_err());
+        let none = RegisterMessage { motor: 1, access: Access::Write(Register::TorqueLimit, Value::Real(f32::NAN)) };
+        assert!(encode_register(&none, None).is_err());
+        for bad in [0.0, -1.0, f32::NAN, f32::INFINITY] {
+            assert!(limits_from_registers(12.5, bad, 10.0).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn random_frames_never_panic_and_what_is_read_is_made_again() {
+        let mut n_read = 0;
+        for frame in random_frames(13, Id::standard(0x11).expect("small")) {
+            if let Ok(feedback) = decode_feedback(&frame, &LIMITS) {
+                n_read += 1;
+                assert_eq!(encode_feedback(frame.id(), &feedback, &LIMITS).expect("own").data(), frame.data());
+            }
+            let _ = decode_register(&frame);
+        }
+        assert!(n_read > 100, "{n_read}");
+    }
+}

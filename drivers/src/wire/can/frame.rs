@@ -1,0 +1,267 @@
+//! A CAN frame as plain data, and how long the bus is busy with it.
+//!
+//! Sources: Robert Bosch, CAN Specification 2.0 (1991), parts A and B; ISO 11898-1:2015 (FD frames and their fixed stuff
+//! bits), field by field as in Linux's `include/linux/can/length.h`. Worst stuffing of classic frames: Davis, Burns, Bril and
+//! Lukkien 2007 (Controller Area Network schedulability analysis: refuted, revisited and revised), equation 1.
+
+use super::CanError;
+
+/// Lengths that an FD frame can have beyond eight bytes.
+const FD_LENGTHS: [usize; 7] = [12, 16, 20, 24, 32, 48, 64];
+/// Acknowledge slot and delimiter, end of frame, and the pause before the next frame may begin.
+const TAIL_BITS: u32 = 2 + 7 + 3;
+
+/// Identifier of a frame; the lower one wins the bus.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Id {
+    value: u32,
+    extended: bool,
+}
+
+impl Id {
+    /// An 11-bit identifier.
+    pub const fn standard(value: u32) -> Result<Self, CanError> {
+        match value {
+            0..=0x7FF => Ok(Self { value, extended: false }),
+            id => Err(CanError::IdRange { id, bits: 11 }),
+        }
+    }
+
+    /// A 29-bit identifier.
+    pub const fn extended(value: u32) -> Result<Self, CanError> {
+        match value {
+            0..=0x1FFF_FFFF => Ok(Self { value, extended: true }),
+            id => Err(CanError::IdRange { id, bits: 29 }),
+        }
+    }
+
+    /// The number.
+    pub const fn value(self) -> u32 {
+        self.value
+    }
+
+    /// Whether it has 29 bits.
+    pub const fn is_extended(self) -> bool {
+        self.extended
+    }
+}
+
+/// What a frame is besides its identifier and its bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Kind {
+    Classic,
+    Remote,
+    Fd { switched: bool },
+}
+
+/// One frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Frame {
+    id: Id,
+    kind: Kind,
+    n_bytes: usize,
+    bytes: [u8; 64],
+}
+
+impl Frame {
+    /// A classic data frame of up to eight bytes.
+    pub fn classic(id: Id, data: &[u8]) -> Result<Self, CanError> {
+        match data.len() {
+            0..=8 => Ok(Self::made(id, Kind::Classic, data)),
+            got_bytes => Err(CanError::PayloadLength { format: "classic", got_bytes }),
+        }
+    }
+
+    /// A request for the data frame of the same identifier; `n_bytes` is the length that the answer shall have.
+    pub fn remote(id: Id, n_bytes: usize) -> Result<Self, CanError> {
+        match n_bytes {
+            0..=8 => Ok(Self { id, kind: Kind::Remote, n_bytes, bytes: [0; 64] }),
+            got_bytes => Err(CanError::PayloadLength { format: "classic", got_bytes }),
+        }
+    }
+
+    /// An FD frame of 0 to 8, 12, 16, 20, 24, 32, 48 or 64 bytes; `switched` when its data are sent at the second bit rate.
+    pub fn fd(id: Id, data: &[u8], switched: bool) -> Result<Self, CanError> {
+        match data.len() {
+            n if n <= 8 || FD_LENGTHS.contains(&n) => Ok(Self::made(id, Kind::Fd { switched }, data)),
+            got_bytes => Err(CanError::PayloadLength { format: "FD", got_bytes }),
+        }
+    }
+
+    fn made(id: Id, kind: Kind, data: &[u8]) -> Self {
+        let mut bytes = [0; 64];
+        bytes[..data.len()].copy_from_slice(data);
+        Self { id, kind, n_bytes: data.len(), bytes }
+    }
+
+    /// The identifier.
+    pub fn id(&self) -> Id {
+        self.id
+    }
+
+    /// The bytes; none in a remote frame.
+    pub fn data(&self) -> &[u8] {
+        match self.kind {
+            Kind::Remote => &[],
+            Kind::Classic | Kind::Fd { .. } => &self.bytes[..self.n_bytes],
+        }
+    }
+
+    /// Bytes it has, or asks for when it is a remote frame.
+    pub fn n_bytes(&self) -> usize {
+        self.n_bytes
+    }
+
+    /// Whether it asks for data instead of bringing them.
+    pub fn is_remote(&self) -> bool {
+        self.kind == Kind::Remote
+    }
+
+    /// Whether it is an FD frame.
+    pub fn is_fd(&self) -> bool {
+        matches!(self.kind, Kind::Fd { .. })
+    }
+
+    /// Whether its data are sent at the second bit rate.
+    pub fn is_switched(&self) -> bool {
+        matches!(self.kind, Kind::Fd { switched: true })
+    }
+
+    /// Bits from its first to the first that the next frame may have, errors and retries left out.
+    ///
+    /// An FD frame's fixed stuff bits are always in. The bits in which the rate switches (bit rate switch and CRC delimiter) are
+    /// split between the rates on the wire; they count at the first, slower one here.
+    pub fn bits(&self, stuffing: Stuffing) -> Bits {
+        let n_data = u32::try_from(8 * self.data().len()).expect("at most 64 bytes");
+        let stuff = |n_bits: u32| match stuffing {
+            Stuffing::None => 0,
+            Stuffing::Worst => (n_bits - 1) / 4,
+        };
+        let Kind::Fd { switched } = self.kind else {
+            // Start, identifier, control and CRC: these and the data are stuffed, what follows is not.
+            let stuffed = if self.id.extended { 54 } else { 34 } + n_data;
+            return Bits { nominal: stuffed + stuff(stuffed) + 1 + TAIL_BITS, data: 0 };
+        };
+        // Start to bit rate switch; then error state, length and data; then stuff count, CRC and their fixed stuff bits.
+        let head = if self.id.extended { 36 } else { 17 };
+        let body = 5 + n_data;
+        let check = if n_data <= 8 * 16 { 4 + 17 + 6 } else { 4 + 21 + 7 };
+        let nominal = head + stuff(head) + 1 + TAIL_BITS;
+        let data = body + stuff(head + body) - stuff(head) + check;
+        match switched {
+            true => Bits { nominal, data },
+            false => Bits { nominal: nominal + data, data: 0 },
+        }
+    }
+}
+
+/// Which stuff bits are counted besides an FD frame's fixed ones.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stuffing {
+    /// None: the shortest that a frame of its length can be.
+    None,
+    /// One after every four bits: no frame of its length is longer.
+    Worst,
+}
+
+/// Bits on the bus, by the rate they are sent at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Bits {
+    /// At the first rate, that of arbitration and of classic frames.
+    pub nominal: u32,
+    /// At the second rate; 0 unless the frame switches.
+    pub data: u32,
+}
+
+/// The two rates of a bus.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BitRates {
+    /// First rate, bits a second.
+    pub nominal_hz: f64,
+    /// Second rate, bits a second; the first one again on a classic bus.
+    pub data_hz: f64,
+}
+
+impl Bits {
+    /// How long they keep the bus busy, seconds.
+    pub fn seconds(self, rates: BitRates) -> f64 {
+        f64::from(self.nominal) / rates.nominal_hz + f64::from(self.data) / rates.data_hz
+    }
+}
+
+/// Share of the time that a bus is busy, 0 to 1 and above 1 if it cannot be, with frames and how often each comes in a second.
+pub fn load_frac(traffic: impl IntoIterator<Item = (Bits, f64)>, rates: BitRates) -> f64 {
+    traffic.into_iter().map(|(bits, rate_hz)| bits.seconds(rates) * rate_hz).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn standard(n_bytes: usize) -> Frame {
+        Frame::classic(Id::standard(0x123).expect("11 bits"), &[0xA5; 64][..n_bytes]).expect("classic")
+    }
+
+    fn extended(n_bytes: usize) -> Frame {
+        Frame::classic(Id::extended(0x1_2345).expect("29 bits"), &[0xA5; 64][..n_bytes]).expect("classic")
+    }
+
+    #[test]
+    fn classic_frames_have_the_published_lengths() {
+        // Davis et al. 2007: 55 + 10 s and 80 + 10 s bits for s bytes in the worst case.
+        for n_bytes in 0..=8_usize {
+            let s = u32::try_from(n_bytes).expect("small");
+            let bits = |frame: Frame, stuffing| frame.bits(stuffing);
+            assert_eq!(bits(standard(n_bytes), Stuffing::None), Bits { nominal: 47 + 8 * s, data: 0 });
+            assert_eq!(bits(extended(n_bytes), Stuffing::None), Bits { nominal: 67 + 8 * s, data: 0 });
+            assert_eq!(bits(standard(n_bytes), Stuffing::Worst), Bits { nominal: 55 + 10 * s, data: 0 });
+            assert_eq!(bits(extended(n_bytes), Stuffing::Worst), Bits { nominal: 80 + 10 * s, data: 0 });
+        }
+        let remote = Frame::remote(Id::standard(1).expect("11 bits"), 8).expect("classic");
+        assert_eq!(remote.bits(Stuffing::None).nominal, 47);
+        assert!(remote.data().is_empty() && remote.n_bytes() == 8);
+    }
+
+    #[test]
+    fn fd_frames_have_the_lengths_of_linux() {
+        // can_frame_bits(true, is_eff, bitstuffing, true, n) of linux/can/length.h, by hand.
+        let cases = [(0, false, 62, 67), (8, false, 126, 147), (16, false, 190, 227), (20, false, 227, 272)];
+        let extended = [(64, false, 579, 712), (0, true, 81, 91), (16, true, 209, 251), (64, true, 598, 736)];
+        for (n_bytes, is_extended, none, worst) in cases.into_iter().chain(extended) {
+            let id = if is_extended { Id::extended(5) } else { Id::standard(5) }.expect("small");
+            let frame = |switched| Frame::fd(id, &[0; 64][..n_bytes], switched).expect("an FD length");
+            for (stuffing, expected) in [(Stuffing::None, none), (Stuffing::Worst, worst)] {
+                let Bits { nominal, data } = frame(true).bits(stuffing);
+                assert_eq!(nominal + data, expected, "{n_bytes} {is_extended} {stuffing:?}");
+                assert_eq!(frame(false).bits(stuffing), Bits { nominal: expected, data: 0 });
+            }
+        }
+        let short = Frame::fd(Id::standard(5).expect("small"), &[0; 8], true).expect("an FD length");
+        assert_eq!(short.bits(Stuffing::None), Bits { nominal: 30, data: 96 });
+    }
+
+    #[test]
+    fn load_is_time_by_rate() {
+        let rates = BitRates { nominal_hz: 1e6, data_hz: 5e6 };
+        // Six motors, a command and an answer each, 500 times a second: 135 us a frame.
+        let bits = standard(8).bits(Stuffing::Worst);
+        let load = load_frac([(bits, 6.0 * 500.0), (bits, 6.0 * 500.0)], rates);
+        assert!((load - 0.81).abs() < 1e-12, "{load}");
+        let switched = Bits { nominal: 30, data: 100 };
+        assert!((switched.seconds(rates) - 50e-6).abs() < 1e-15);
+    }
+
+    #[test]
+    fn what_no_frame_can_be_is_refused() {
+        assert_eq!(Id::standard(0x800), Err(CanError::IdRange { id: 0x800, bits: 11 }));
+        assert_eq!(Id::extended(0x2000_0000), Err(CanError::IdRange { id: 0x2000_0000, bits: 29 }));
+        let id = Id::standard(0x7FF).expect("11 bits");
+        assert_eq!(Frame::classic(id, &[0; 9]), Err(CanError::PayloadLength { format: "classic", got_bytes: 9 }));
+        assert_eq!(Frame::remote(id, 9), Err(CanError::PayloadLength { format: "classic", got_bytes: 9 }));
+        for n in 0..=65 {
+            let is_made = Frame::fd(id, &[0; 65][..n], false).is_ok();
+            assert_eq!(is_made, n <= 8 || [12, 16, 20, 24, 32, 48, 64].contains(&n), "{n}");
+        }
+        assert_ne!(Id::standard(5).expect("small"), Id::extended(5).expect("small"));
+    }
+}

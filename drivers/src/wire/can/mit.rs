@@ -1,0 +1,233 @@
+//! MIT mode: position, velocity, two gains and a torque in the eight bytes of one frame.
+//!
+//! Source: Ben Katz, mini cheetah motor controller (`pack_cmd`, `unpack_reply`); the same bytes in `cmjang/DM_Control_Python`
+//! `DM_CAN.py` and `neurobionics/TMotorCANControl` `mit_can.py`. The drive does
+//! `torque = kp (position - measured) + kd (velocity - measured) + torque`. Values outside the limits are clamped, as there.
+
+use super::CanError;
+use super::scale::Scale;
+
+/// The ranges that the counts of a motor cover: all but the gains from the negative to the positive number.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Limits {
+    /// Of the output shaft, rad.
+    pub position_rad: f64,
+    /// Of the output shaft, rad/s.
+    pub velocity_rad_s: f64,
+    /// At the output shaft, N m.
+    pub torque_nm: f64,
+    /// From 0, N m / rad.
+    pub kp_nm_rad: f64,
+    /// From 0, N m s / rad.
+    pub kd_nm_s_rad: f64,
+}
+
+impl Limits {
+    /// Limits with the gains that most motors have: up to 500 N m / rad and 5 N m s / rad.
+    pub const fn of(position_rad: f64, velocity_rad_s: f64, torque_nm: f64) -> Self {
+        Self { position_rad, velocity_rad_s, torque_nm, kp_nm_rad: 500.0, kd_nm_s_rad: 5.0 }
+    }
+
+    /// The command that is really sent: every number within its limits; no number stays none.
+    pub fn clamped(&self, command: &Command) -> Command {
+        let within = |value: f64, most: f64| value.clamp(-most, most);
+        Command {
+            position_rad: within(command.position_rad, self.position_rad),
+            velocity_rad_s: within(command.velocity_rad_s, self.velocity_rad_s),
+            kp_nm_rad: command.kp_nm_rad.clamp(0.0, self.kp_nm_rad),
+            kd_nm_s_rad: command.kd_nm_s_rad.clamp(0.0, self.kd_nm_s_rad),
+            torque_nm: within(command.torque_nm, self.torque_nm),
+        }
+    }
+}
+
+/// What a motor shall do.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Command {
+    /// Where to, rad.
+    pub position_rad: f64,
+    /// How fast, rad/s.
+    pub velocity_rad_s: f64,
+    /// Stiffness towards the position, N m / rad.
+    pub kp_nm_rad: f64,
+    /// Damping towards the velocity, N m s / rad.
+    pub kd_nm_s_rad: f64,
+    /// Torque on top, N m.
+    pub torque_nm: f64,
+}
+
+/// What a motor does.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Motion {
+    /// Of the output shaft, rad.
+    pub position_rad: f64,
+    /// Of the output shaft, rad/s.
+    pub velocity_rad_s: f64,
+    /// At the output shaft by the drive's estimate, N m.
+    pub torque_nm: f64,
+}
+
+/// How a field of MIT mode is cut into counts.
+struct Scales {
+    position: Scale,
+    velocity: Scale,
+    kp: Scale,
+    kd: Scale,
+    torque: Scale,
+}
+
+impl Scales {
+    fn of(limits: &Limits) -> Self {
+        Self {
+            position: Scale::symmetric(limits.position_rad, 16),
+            velocity: Scale::symmetric(limits.velocity_rad_s, 12),
+            kp: Scale::positive(limits.kp_nm_rad, 12),
+            kd: Scale::positive(limits.kd_nm_s_rad, 12),
+            torque: Scale::symmetric(limits.torque_nm, 12),
+        }
+    }
+}
+
+/// A command as the eight bytes of its frame; values outside the limits are clamped, no number is refused.
+pub fn encode(command: &Command, limits: &Limits) -> Result<[u8; 8], CanError> {
+    let scales = Scales::of(limits);
+    let position = scales.position.raw_from_value("the position", command.position_rad)?;
+    let velocity = scales.velocity.raw_from_value("the velocity", command.velocity_rad_s)?;
+    let kp = scales.kp.raw_from_value("kp", command.kp_nm_rad)?;
+    let kd = scales.kd.raw_from_value("kd", command.kd_nm_s_rad)?;
+    let torque = scales.torque.raw_from_value("the torque", command.torque_nm)?;
+    let fields = [(position, 16), (velocity, 12), (kp, 12), (kd, 12), (torque, 12)];
+    Ok(fields.iter().fold(0_u64, |bits, (raw, n_bits)| bits << n_bits | u64::from(*raw)).to_be_bytes())
+}
+
+/// Reads a command: what a simulated motor gets.
+pub fn decode(bytes: &[u8; 8], limits: &Limits) -> Command {
+    let scales = Scales::of(limits);
+    let [p1, p0, v1, v0_kp1, kp0, kd1, kd0_t1, t0] = *bytes;
+    Command {
+        position_rad: scales.position.value_from_raw(u16::from_be_bytes([p1, p0])),
+        velocity_rad_s: scales.velocity.value_from_raw(high_twelve(v1, v0_kp1)),
+        kp_nm_rad: scales.kp.value_from_raw(low_twelve(v0_kp1, kp0)),
+        kd_nm_s_rad: scales.kd.value_from_raw(high_twelve(kd1, kd0_t1)),
+        torque_nm: scales.torque.value_from_raw(low_twelve(kd0_t1, t0)),
+    }
+}
+
+/// The five bytes of a motion, as they follow the motor's number in every maker's feedback.
+pub fn encode_motion(motion: &Motion, limits: &Limits) -> Result<[u8; 5], CanError> {
+    let scales = Scales::of(limits);
+    let [p1, p0] = scales.position.raw_from_value("the position", motion.position_rad)?.to_be_bytes();
+    let velocity = scales.velocity.raw_from_value("the velocity", motion.velocity_rad_s)?;
+    let torque = scales.torque.raw_from_value("the torque", motion.torque_nm)?;
+    let [_, b2, b3, b4] = (u32::from(velocity) << 12 | u32::from(torque)).to_be_bytes();
+    Ok([p1, p0, b2, b3, b4])
+}
+
+/// Reads the five bytes of a motion.
+pub fn decode_motion(bytes: [u8; 5], limits: &Limits) -> Motion {
+    let scales = Scales::of(limits);
+    let [p1, p0, v1, v0_t1, t0] = bytes;
+    Motion {
+        position_rad: scales.position.value_from_raw(u16::from_be_bytes([p1, p0])),
+        velocity_rad_s: scales.velocity.value_from_raw(high_twelve(v1, v0_t1)),
+        torque_nm: scales.torque.value_from_raw(low_twelve(v0_t1, t0)),
+    }
+}
+
+/// Twelve bits that end in the middle of their second byte.
+fn high_twelve(first: u8, second: u8) -> u16 {
+    u16::from_be_bytes([first, second]) >> 4
+}
+
+/// Twelve bits that begin in the middle of their first byte.
+fn low_twelve(first: u8, second: u8) -> u16 {
+    u16::from_be_bytes([first, second]) & 0xFFF
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::Random;
+    use super::*;
+
+    const LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
+
+    #[test]
+    fn commands_are_the_bytes_of_the_makers_sample() {
+        // DM_CAN.py, controlMIT with the limits of a DM4310: nothing, all ends, and kp = 50, kd = 1, q = 1, dq = -3, tau = 2.5.
+        let command = |kp_nm_rad, kd_nm_s_rad, position_rad, velocity_rad_s, torque_nm| Command {
+            position_rad,
+            velocity_rad_s,
+            kp_nm_rad,
+            kd_nm_s_rad,
+            torque_nm,
+        };
+        let cases = [
+            (command(0.0, 0.0, 0.0, 0.0, 0.0), [0x7F, 0xFF, 0x7F, 0xF0, 0x00, 0x00, 0x07, 0xFF]),
+            (command(500.0, 5.0, 12.5, 30.0, 10.0), [0xFF; 8]),
+            (command(0.0, 0.0, -12.5, -30.0, -10.0), [0x00; 8]),
+            // 35388.9, 1842.75, 409.5, 819, 2559.375: the nearest counts, and 409 of the two next to 409.5.
+            (command(50.0, 1.0, 1.0, -3.0, 2.5), [0x8A, 0x3D, 0x73, 0x31, 0x99, 0x33, 0x39, 0xFF]),
+        ];
+        for (command, bytes) in cases {
+            assert_eq!(encode(&command, &LIMITS), Ok(bytes), "{command:?}");
+        }
+    }
+
+    #[test]
+    fn any_bytes_are_a_command_and_come_back() {
+        let mut random = Random(3);
+        for _ in 0..20_000 {
+            let bytes = (u64::from(random.next()) << 32 | u64::from(random.next())).to_be_bytes();
+            assert_eq!(encode(&decode(&bytes, &LIMITS), &LIMITS), Ok(bytes));
+            let motion = bytes[..5].try_into().expect("five");
+            assert_eq!(encode_motion(&decode_motion(motion, &LIMITS), &LIMITS), Ok(motion));
+        }
+    }
+
+    #[test]
+    fn commands_come_back_to_the_resolution_over_the_whole_range() {
+        let mut random = Random(5);
+        let mut spread = |most: f64| (2.0 * random.share() - 1.0) * most;
+        for _ in 0..20_000 {
+            let command = Command {
+                position_rad: spread(12.5),
+                velocity_rad_s: spread(30.0),
+                kp_nm_rad: spread(500.0).abs(),
+                kd_nm_s_rad: spread(5.0).abs(),
+                torque_nm: spread(10.0),
+            };
+            let back = decode(&encode(&command, &LIMITS).expect("numbers"), &LIMITS);
+            // Half a step of the range.
+            for (name, off, range, counts) in [
+                ("position", back.position_rad - command.position_rad, 25.0, 65_535.0),
+                ("velocity", back.velocity_rad_s - command.velocity_rad_s, 60.0, 4095.0),
+                ("kp", back.kp_nm_rad - command.kp_nm_rad, 500.0, 4095.0),
+                ("kd", back.kd_nm_s_rad - command.kd_nm_s_rad, 5.0, 4095.0),
+                ("torque", back.torque_nm - command.torque_nm, 20.0, 4095.0),
+            ] {
+                assert!(off.abs() <= 0.5 * range / counts * (1.0 + 1e-9), "{name}: {off}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_beyond_the_limits_is_clamped_and_no_number_is_refused() {
+        let wild = Command {
+            position_rad: 1e9,
+            velocity_rad_s: -1e9,
+            kp_nm_rad: -1.0,
+            kd_nm_s_rad: 6.0,
+            torque_nm: f64::INFINITY,
+        };
+        let clamped = LIMITS.clamped(&wild);
+        assert_eq!(
+            clamped,
+            Command { position_rad: 12.5, velocity_rad_s: -30.0, kp_nm_rad: 0.0, kd_nm_s_rad: 5.0, torque_nm: 10.0 }
+        );
+        assert_eq!(encode(&wild, &LIMITS), encode(&clamped, &LIMITS));
+        let none = Command { kp_nm_rad: f64::NAN, ..Command::default() };
+        assert_eq!(encode(&none, &LIMITS), Err(CanError::NotFinite { field: "kp" }));
+        let none = Motion { position_rad: 0.0, velocity_rad_s: f64::NAN, torque_nm: 0.0 };
+        assert_eq!(encode_motion(&none, &LIMITS), Err(CanError::NotFinite { field: "the velocity" }));
+    }
+}

@@ -1,0 +1,407 @@
+//! ODrive's CANSimple: six bits of node and five of command in an 11-bit identifier, little-endian numbers in the bytes.
+//!
+//! Sources: `odriverobotics/ODrive` `tools/odrive-cansimple.dbc` (messages since firmware 0.5); ODrive CAN protocol page and DBC of
+//! firmware 0.6.10 (heartbeat, errors, torques, endpoints, temperature). Turns on the wire are radians here. What a node tells
+//! comes by itself at the rates set in its `can.config` or `axis.config.can`, or when asked with a remote frame.
+
+use super::{CanError, Frame, Id};
+use std::f64::consts::TAU;
+
+/// How frames of a node are called in errors.
+const MESSAGE: &str = "ODrive message";
+/// Feed-forward counts: thousandths of a turn a second, and of a newton metre.
+const FEED_FORWARD: f64 = 1e-3;
+
+/// Number of an axis on the bus, 0 to 62; 63 is a node without one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Node(u8);
+
+impl Node {
+    /// A node of its number.
+    pub fn new(number: u8) -> Result<Self, CanError> {
+        match number {
+            0..=63 => Ok(Self(number)),
+            _ => Err(CanError::IdRange { id: number.into(), bits: 6 }),
+        }
+    }
+
+    /// Its number.
+    pub fn number(self) -> u8 {
+        self.0
+    }
+}
+
+/// The lower five bits of an identifier.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Code {
+    /// `Heartbeat`.
+    Heartbeat = 0x01,
+    /// `Estop`.
+    EmergencyStop = 0x02,
+    /// `Get_Error`.
+    Errors = 0x03,
+    /// `RxSdo`: reads or writes an endpoint.
+    EndpointRequest = 0x04,
+    /// `TxSdo`: the answer to that.
+    EndpointAnswer = 0x05,
+    /// `Set_Axis_State`.
+    SetState = 0x07,
+    /// `Get_Encoder_Estimates`.
+    Motion = 0x09,
+    /// `Set_Controller_Mode`.
+    SetMode = 0x0B,
+    /// `Set_Input_Pos`.
+    SetPosition = 0x0C,
+    /// `Set_Input_Vel`.
+    SetVelocity = 0x0D,
+    /// `Set_Input_Torque`.
+    SetTorque = 0x0E,
+    /// `Get_Iq`.
+    Current = 0x14,
+    /// `Clear_Errors`.
+    ClearErrors = 0x18,
+    /// `Get_Torques`.
+    Torques = 0x1C,
+}
+
+/// What an axis is at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[expect(missing_docs, reason = "they are ODrive's names")]
+#[repr(u8)]
+pub enum State {
+    Undefined = 0,
+    Idle = 1,
+    StartupSequence = 2,
+    FullCalibrationSequence = 3,
+    MotorCalibration = 4,
+    SensorlessControl = 5,
+    EncoderIndexSearch = 6,
+    EncoderOffsetCalibration = 7,
+    ClosedLoopControl = 8,
+    LockinSpin = 9,
+    EncoderDirectionFind = 10,
+    Homing = 11,
+    EncoderHallPolarityCalibration = 12,
+    EncoderHallPhaseCalibration = 13,
+    AnticoggingCalibration = 14,
+}
+
+impl State {
+    const ALL: [Self; 15] = [
+        Self::Undefined,
+        Self::Idle,
+        Self::StartupSequence,
+        Self::FullCalibrationSequence,
+        Self::MotorCalibration,
+        Self::SensorlessControl,
+        Self::EncoderIndexSearch,
+        Self::EncoderOffsetCalibration,
+        Self::ClosedLoopControl,
+        Self::LockinSpin,
+        Self::EncoderDirectionFind,
+        Self::Homing,
+        Self::EncoderHallPolarityCalibration,
+        Self::EncoderHallPhaseCalibration,
+        Self::AnticoggingCalibration,
+    ];
+}
+
+/// What is controlled.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[expect(missing_docs, reason = "they are ODrive's names")]
+#[repr(u8)]
+pub enum Control {
+    Voltage = 0,
+    Torque = 1,
+    Velocity = 2,
+    Position = 3,
+}
+
+/// What a host sends. Numbers that are none are refused, feed-forward is clamped to what its 16 bits hold.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Request {
+    /// Asks for a message of a node with a remote frame.
+    Ask(Code),
+    /// Lets the shaft go at once.
+    EmergencyStop,
+    /// Forgets the errors.
+    ClearErrors,
+    /// Goes to a state.
+    SetState(State),
+    /// What is controlled, passed through without ramp or filter (input mode 1).
+    SetMode(Control),
+    /// Where to.
+    SetPosition {
+        /// Of the motor, rad.
+        position_rad: f64,
+        /// Feed-forward in thousandths of a turn a second, up to 205 rad/s.
+        velocity_rad_s: f64,
+        /// Feed-forward in mN m, up to 32 N m.
+        torque_nm: f64,
+    },
+    /// How fast.
+    SetVelocity {
+        /// Of the motor, rad/s.
+        velocity_rad_s: f64,
+        /// Feed-forward, N m.
+        torque_nm: f64,
+    },
+    /// How strong, N m.
+    SetTorque(f64),
+    /// Tell an endpoint, by its number in the firmware's `flat_endpoints.json`.
+    ReadEndpoint(u16),
+    /// Set an endpoint, for instance the axis' watchdog; bytes as its type has them.
+    WriteEndpoint(u16, [u8; 4]),
+}
+
+/// What a node sends.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Answer {
+    /// That it lives.
+    Heartbeat {
+        /// What is wrong, bits of the firmware's `ODrive.Error`.
+        errors: u32,
+        /// What it is at.
+        state: State,
+    },
+    /// What is wrong and what stopped it, bits of the firmware's `ODrive.Error`.
+    Errors {
+        /// At present; firmware 0.5 tells the motor's errors here.
+        active: u32,
+        /// When it let the shaft go.
+        disarm_reason: u32,
+    },
+    /// Where the motor is.
+    Motion {
+        /// Rad.
+        position_rad: f64,
+        /// Rad/s.
+        velocity_rad_s: f64,
+    },
+    /// Current that makes torque, A.
+    Current {
+        /// Asked for.
+        target_a: f64,
+        /// Measured.
+        measured_a: f64,
+    },
+    /// Torque, N m.
+    Torques {
+        /// Asked for.
+        target_nm: f64,
+        /// Estimated.
+        estimate_nm: f64,
+    },
+    /// What an endpoint holds; bytes as its type has them.
+    Endpoint(u16, [u8; 4]),
+}
+
+/// The frame of a request to a node.
+pub fn encode_request(node: Node, request: &Request) -> Result<Frame, CanError> {
+    let data = |code: Code, bytes: &[u8]| Frame::classic(id_of(node, code)?, bytes);
+    let endpoint = |opcode: u8, endpoint: u16, value: [u8; 4]| {
+        let ([low, high], [a, b, c, d]) = (endpoint.to_le_bytes(), value);
+        data(Code::EndpointRequest, &[opcode, low, high, 0, a, b, c, d])
+    };
+    match *request {
+        Request::Ask(code) => Frame::remote(id_of(node, code)?, 8),
+        Request::EmergencyStop => data(Code::EmergencyStop, &[]),
+        Request::ClearErrors => data(Code::ClearErrors, &[0]),
+        Request::SetState(state) => data(Code::SetState, &u32::from(state as u8).to_le_bytes()),
+        Request::SetMode(control) => data(Code::SetMode, &[control as u8, 0, 0, 0, 1, 0, 0, 0]),
+        Request::SetPosition { position_rad, velocity_rad_s, torque_nm } => {
+            let [a, b, c, d] = real("the position", position_rad / TAU)?;
+            let [e, f] = thousandths("the velocity", velocity_rad_s / TAU)?;
+            let [g, h] = thousandths("the torque", torque_nm)?;
+            data(Code::SetPosition, &[a, b, c, d, e, f, g, h])
+        }
+        Request::SetVelocity { velocity_rad_s, torque_nm } => {
+            let halves = [real("the velocity", velocity_rad_s / TAU)?, real("the torque", torque_nm)?];
+            data(Code::SetVelocity, halves.as_flattened())
+        }
+        Request::SetTorque(torque_nm) => data(Code::SetTorque, &real("the torque", torque_nm)?),
+        Request::ReadEndpoint(number) => endpoint(0, number, [0; 4]),
+        Request::WriteEndpoint(number, value) => endpoint(1, number, value),
+    }
+}
+
+/// Reads what a node sends.
+pub fn decode_answer(frame: &Frame) -> Result<(Node, Answer), CanError> {
+    let id = frame.id();
+    if frame.is_remote() || id.is_extended() {
+        return Err(CanError::Foreign { message: MESSAGE, id: id.value() });
+    }
+    let [.., high, low] = id.value().to_be_bytes();
+    let number = high << 3 | low >> 5;
+    let got_bytes = frame.data().len();
+    let Ok([a, b, c, d, e, f, g, h]) = <[u8; 8]>::try_from(frame.data()) else {
+        return Err(CanError::Length { message: MESSAGE, got_bytes, expected_bytes: 8 });
+    };
+    let words = (u32::from_le_bytes([a, b, c, d]), u32::from_le_bytes([e, f, g, h]));
+    let reals = || {
+        let (first, second) = (f64::from(f32::from_bits(words.0)), f64::from(f32::from_bits(words.1)));
+        match first.is_finite() && second.is_finite() {
+            true => Ok((first, second)),
+            false => Err(CanError::NotFinite { field: "a value of an ODrive" }),
+        }
+    };
+    let is = |code: Code| low & 0x1F == code as u8;
+    let answer = if is(Code::Heartbeat) {
+        let state = State::ALL.into_iter().find(|state| *state as u8 == e);
+        let undefined = CanError::Undefined { field: "the state of the axis", raw: e.into() };
+        Answer::Heartbeat { errors: words.0, state: state.ok_or(undefined)? }
+    } else if is(Code::Errors) {
+        Answer::Errors { active: words.0, disarm_reason: words.1 }
+    } else if is(Code::EndpointAnswer) {
+        Answer::Endpoint(u16::from_le_bytes([b, c]), [e, f, g, h])
+    } else if is(Code::Motion) {
+        let (position, velocity) = reals()?;
+        Answer::Motion { position_rad: position * TAU, velocity_rad_s: velocity * TAU }
+    } else if is(Code::Current) {
+        let (target_a, measured_a) = reals()?;
+        Answer::Current { target_a, measured_a }
+    } else if is(Code::Torques) {
+        let (target_nm, estimate_nm) = reals()?;
+        Answer::Torques { target_nm, estimate_nm }
+    } else {
+        return Err(CanError::Undefined { field: "the command of an ODrive", raw: u32::from(low & 0x1F) });
+    };
+    Ok((Node(number), answer))
+}
+
+/// The frame of what a node sends, for axes that are simulated.
+pub fn encode_answer(node: Node, answer: &Answer) -> Result<Frame, CanError> {
+    let (code, halves) = match *answer {
+        Answer::Heartbeat { errors, state } => (Code::Heartbeat, [errors.to_le_bytes(), [state as u8, 0, 0, 0]]),
+        Answer::Errors { active, disarm_reason } => (Code::Errors, [active.to_le_bytes(), disarm_reason.to_le_bytes()]),
+        Answer::Endpoint(number, value) => {
+            let [low, high] = number.to_le_bytes();
+            (Code::EndpointAnswer, [[0, low, high, 0], value])
+        }
+        Answer::Motion { position_rad, velocity_rad_s } => {
+            (Code::Motion, [real("the position", position_rad / TAU)?, real("the velocity", velocity_rad_s / TAU)?])
+        }
+        Answer::Current { target_a, measured_a } => {
+            (Code::Current, [real("the current", target_a)?, real("the current", measured_a)?])
+        }
+        Answer::Torques { target_nm, estimate_nm } => {
+            (Code::Torques, [real("the torque", target_nm)?, real("the torque", estimate_nm)?])
+        }
+    };
+    Frame::classic(id_of(node, code)?, halves.as_flattened())
+}
+
+fn id_of(node: Node, code: Code) -> Result<Id, CanError> {
+    Id::standard(u32::from(node.0) << 5 | u32::from(code as u8))
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "what does not fit becomes infinite and is refused")]
+fn real(field: &'static str, value: f64) -> Result<[u8; 4], CanError> {
+    let single = value as f32;
+    if single.is_finite() { Ok(single.to_le_bytes()) } else { Err(CanError::NotFinite { field }) }
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "the cast clamps, which is meant")]
+fn thousandths(field: &'static str, value: f64) -> Result<[u8; 2], CanError> {
+    match value.is_nan() {
+        true => Err(CanError::NotFinite { field }),
+        false => Ok(((value / FEED_FORWARD).round() as i16).to_le_bytes()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::{Random, cut_and_doubled, random_frames};
+    use super::*;
+
+    const NODE: Node = Node(1);
+
+    fn frame(id: u32, bytes: &[u8]) -> Frame {
+        Frame::classic(Id::standard(id).expect("11 bits"), bytes).expect("classic")
+    }
+
+    #[test]
+    fn requests_are_the_published_bytes() {
+        let sent = |request| encode_request(NODE, &request).expect("numbers");
+        // The example of odrive-can-protocol: -2.5 turns a second and 0.25 N m to node 1.
+        let velocity = Request::SetVelocity { velocity_rad_s: -2.5 * TAU, torque_nm: 0.25 };
+        assert_eq!(sent(velocity), frame(0x02D, &[0x00, 0x00, 0x20, 0xC0, 0x00, 0x00, 0x80, 0x3E]));
+        let position = Request::SetPosition { position_rad: TAU, velocity_rad_s: -0.5 * TAU, torque_nm: 99.0 };
+        assert_eq!(sent(position), frame(0x02C, &[0, 0, 0x80, 0x3F, 0x0C, 0xFE, 0xFF, 0x7F]));
+        assert_eq!(sent(Request::SetTorque(1.0)), frame(0x02E, &[0, 0, 0x80, 0x3F]));
+        assert_eq!(sent(Request::SetState(State::ClosedLoopControl)), frame(0x027, &[8, 0, 0, 0]));
+        assert_eq!(sent(Request::SetMode(Control::Position)), frame(0x02B, &[3, 0, 0, 0, 1, 0, 0, 0]));
+        assert_eq!(sent(Request::ClearErrors), frame(0x038, &[0]));
+        assert_eq!(sent(Request::EmergencyStop), frame(0x022, &[]));
+        assert_eq!(sent(Request::ReadEndpoint(0x0182)), frame(0x024, &[0, 0x82, 0x01, 0, 0, 0, 0, 0]));
+        assert_eq!(sent(Request::WriteEndpoint(0x0182, [1, 0, 0, 0])), frame(0x024, &[1, 0x82, 0x01, 0, 1, 0, 0, 0]));
+        let asked = sent(Request::Ask(Code::Motion));
+        assert!(asked.is_remote() && asked.id().value() == 0x029 && asked.n_bytes() == 8);
+    }
+
+    #[test]
+    fn answers_are_read_and_made_again() {
+        for (bytes, expected) in [
+            (
+                frame(0x021, &[1, 0, 0, 0x80, 8, 0, 0, 0]),
+                Answer::Heartbeat { errors: 0x8000_0001, state: State::ClosedLoopControl },
+            ),
+            (frame(0x023, &[0, 0, 0, 0, 2, 0, 0, 0]), Answer::Errors { active: 0, disarm_reason: 2 }),
+            (frame(0x025, &[0, 0x82, 0x01, 0, 1, 2, 3, 4]), Answer::Endpoint(0x0182, [1, 2, 3, 4])),
+            (
+                frame(0x029, &[0, 0, 0x80, 0x3F, 0, 0, 0x20, 0xC0]),
+                Answer::Motion { position_rad: TAU, velocity_rad_s: -2.5 * TAU },
+            ),
+            (frame(0x034, &[0, 0, 0x80, 0x3F, 0, 0, 0x80, 0x3E]), Answer::Current { target_a: 1.0, measured_a: 0.25 }),
+            (
+                frame(0x03C, &[0, 0, 0x80, 0x3F, 0, 0, 0x80, 0x3E]),
+                Answer::Torques { target_nm: 1.0, estimate_nm: 0.25 },
+            ),
+        ] {
+            assert_eq!(decode_answer(&bytes), Ok((NODE, expected)));
+            assert_eq!(encode_answer(NODE, &expected), Ok(bytes));
+        }
+        // Firmware 0.6 puts the result of the last procedure and a flag behind the state.
+        assert!(decode_answer(&frame(0x021, &[0, 0, 0, 0, 1, 3, 1, 0])).is_ok());
+    }
+
+    #[test]
+    fn motion_comes_back_to_single_precision() {
+        let mut random = Random(19);
+        for _ in 0..10_000 {
+            let (position_rad, velocity_rad_s) = ((random.share() - 0.5) * 1e4, (random.share() - 0.5) * 1e3);
+            let answer = Answer::Motion { position_rad, velocity_rad_s };
+            let node = Node::new(random.next().to_le_bytes()[0] & 63).expect("masked");
+            let (from, back) = decode_answer(&encode_answer(node, &answer).expect("numbers")).expect("own bytes");
+            let Answer::Motion { position_rad: position, velocity_rad_s: velocity } = back else { panic!("{back:?}") };
+            // Half a unit in the last of 24 bits.
+            assert!(from == node && (position - position_rad).abs() <= position_rad.abs() / f64::from(1 << 24));
+            assert!((velocity - velocity_rad_s).abs() <= velocity_rad_s.abs() / f64::from(1 << 24));
+        }
+    }
+
+    #[test]
+    fn what_is_amiss_is_refused() {
+        assert_eq!(Node::new(64), Err(CanError::IdRange { id: 64, bits: 6 }));
+        for bent in cut_and_doubled(&frame(0x029, &[0; 8])) {
+            assert!(matches!(decode_answer(&bent), Err(CanError::Length { .. })));
+        }
+        let undefined = |field, raw| Err(CanError::Undefined { field, raw });
+        assert_eq!(decode_answer(&frame(0x021, &[0, 0, 0, 0, 15, 0, 0, 0])), undefined("the state of the axis", 15));
+        assert_eq!(decode_answer(&frame(0x03F, &[0; 8])), undefined("the command of an ODrive", 0x1F));
+        assert!(matches!(decode_answer(&frame(0x029, &[0xFF; 8])), Err(CanError::NotFinite { .. })));
+        for bad in [f64::NAN, f64::INFINITY, 1e300] {
+            assert!(encode_request(NODE, &Request::SetTorque(bad)).is_err(), "{bad}");
+        }
+        let none = Request::SetPosition { position_rad: 0.0, velocity_rad_s: f64::NAN, torque_nm: 0.0 };
+        assert_eq!(encode_request(NODE, &none), Err(CanError::NotFinite { field: "the velocity" }));
+        let mut n_read = 0;
+        for frame in random_frames(23, Id::standard(0x029).expect("11 bits")) {
+            if decode_answer(&frame).is_ok() {
+                n_read += 1;
+            }
+        }
+        assert!(n_read > 100, "{n_read}");
+    }
+}

@@ -1,0 +1,494 @@
+//! Robstride motors in their private protocol: 29-bit identifiers that carry a communication type, two numbers and flags.
+//!
+//! Sources: `RobStride/SampleProgram` (`Robstride.cpp`: types 0 to 25 and their bytes, active report of 10 ms); RS00 to RS06 user
+//! manuals (scalings, fault bits, parameter table, `canTimeout` of 20 000 counts a second, 0 for never). The scalings are those of
+//! the manuals; the table of the Python package `robstride_dynamics` differs for RS00, RS03, RS05 and RS06 and gives torques of an
+//! RS05 three times too high (motorbridge/motorbridge pull request 11). RS02 firmware up to 0.2.2.11 counts 12.5 rad as the end.
+
+use super::mit::{Command, Limits, Motion};
+use super::scale::Scale;
+use super::{CanError, Frame, Id, eight};
+use std::f64::consts::PI;
+
+/// How frames that come from a motor are called in errors.
+const MESSAGE: &str = "answer of a Robstride motor";
+/// What some orders carry so that nothing else is taken for them.
+const SEAL: [u8; 6] = [1, 2, 3, 4, 5, 6];
+/// Counts of `canTimeout` a second.
+const TIMEOUT_TICKS_HZ: f64 = 20_000.0;
+/// The number that a motor's answer to [`Request::Identify`] goes to.
+const EVERYONE: u8 = 0xFE;
+
+/// A model.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[expect(missing_docs, reason = "they are the names on the motors")]
+pub enum Model {
+    Rs00,
+    Rs01,
+    Rs02,
+    Rs03,
+    Rs04,
+    Rs05,
+    Rs06,
+}
+
+impl Model {
+    /// What its counts cover.
+    pub const fn limits(self) -> Limits {
+        match self {
+            Self::Rs00 => Limits::of(4.0 * PI, 33.0, 14.0),
+            Self::Rs01 | Self::Rs02 => Limits::of(4.0 * PI, 44.0, 17.0),
+            Self::Rs03 => large(20.0, 60.0),
+            Self::Rs04 => large(15.0, 120.0),
+            Self::Rs05 => Limits::of(4.0 * PI, 50.0, 5.5),
+            Self::Rs06 => large(50.0, 36.0),
+        }
+    }
+}
+
+/// Limits of the large motors, whose gains count further.
+const fn large(velocity_rad_s: f64, torque_nm: f64) -> Limits {
+    Limits { position_rad: 4.0 * PI, velocity_rad_s, torque_nm, kp_nm_rad: 5000.0, kd_nm_s_rad: 100.0 }
+}
+
+/// Bits 24 to 28 of the identifier.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+enum Communication {
+    Identity = 0,
+    Motion = 1,
+    Feedback = 2,
+    Enable = 3,
+    Stop = 4,
+    SetZero = 6,
+    ReadParameter = 17,
+    WriteParameter = 18,
+    Fault = 21,
+    Store = 22,
+    ActiveReport = 24,
+}
+
+/// A parameter that this program reads or writes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u16)]
+pub enum Parameter {
+    /// `run_mode`: 0 obeys motion commands.
+    RunMode = 0x7005,
+    /// `limit_torque`, N m.
+    TorqueLimit = 0x700B,
+    /// `limit_cur`, A.
+    CurrentLimit = 0x7018,
+    /// `mechPos`: the output shaft, rad; read only.
+    Position = 0x7019,
+    /// `mechVel`: the output shaft, rad/s; read only.
+    Velocity = 0x701B,
+    /// `VBUS`: supply, V; read only.
+    Supply = 0x701C,
+    /// `loc_kp`: stiffness of the motor's own position mode.
+    PositionGain = 0x701E,
+    /// `EPScan_time`: how often the motor reports by itself, 1 is every 10 ms and each more 5 ms longer.
+    ReportInterval = 0x7026,
+    /// `canTimeout`: how long it obeys its last command, 20 000 a second; 0 is for ever.
+    Timeout = 0x7028,
+}
+
+impl Parameter {
+    const ALL: [Self; 9] = [
+        Self::RunMode,
+        Self::TorqueLimit,
+        Self::CurrentLimit,
+        Self::Position,
+        Self::Velocity,
+        Self::Supply,
+        Self::PositionGain,
+        Self::ReportInterval,
+        Self::Timeout,
+    ];
+
+    /// How many bytes of a whole number it holds; `None` where it is a real one.
+    fn whole_bytes(self) -> Option<usize> {
+        match self {
+            Self::RunMode => Some(1),
+            Self::ReportInterval => Some(2),
+            Self::Timeout => Some(4),
+            _ => None,
+        }
+    }
+}
+
+/// What a parameter holds.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Value {
+    /// In parameters of codes and ticks.
+    Whole(u32),
+    /// In parameters of SI values.
+    Real(f32),
+}
+
+/// What a host sends.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Request {
+    /// Type 0: who are you?
+    Identify,
+    /// Type 1: move; clamped to the limits.
+    Move(Command),
+    /// Type 3: obey from now on.
+    Enable,
+    /// Type 4: let the shaft go, and forget the fault if so asked.
+    Stop {
+        /// Whether the fault is forgotten.
+        clear_fault: bool,
+    },
+    /// Type 6: the present position is zero.
+    SetZero,
+    /// Type 17: tell a parameter.
+    Read(Parameter),
+    /// Type 18: set a parameter until the power goes.
+    Write(Parameter, Value),
+    /// Type 22: keep all parameters over a loss of power.
+    Store,
+    /// Type 24: report every [`Parameter::ReportInterval`] unasked, or stop it.
+    ReportActively(bool),
+}
+
+/// Bits 22 and 23 of a feedback's identifier.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Mode {
+    /// The shaft is free.
+    Reset = 0,
+    /// It measures its encoder.
+    Calibration = 1,
+    /// It obeys.
+    Run = 2,
+}
+
+/// Bits 16 to 21 of a feedback's identifier.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Faults(pub u8);
+
+impl Faults {
+    /// Supply too low.
+    pub const UNDER_VOLTAGE: u8 = 1;
+    /// Too much current in a phase.
+    pub const OVER_CURRENT: u8 = 1 << 1;
+    /// Too hot.
+    pub const OVER_TEMPERATURE: u8 = 1 << 2;
+    /// The magnetic encoder fails.
+    pub const ENCODER: u8 = 1 << 3;
+    /// Blocked or overloaded.
+    pub const OVERLOAD: u8 = 1 << 4;
+    /// The encoder was never measured.
+    pub const UNCALIBRATED: u8 = 1 << 5;
+}
+
+/// What a motor sends.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Answer {
+    /// Type 0: its serial number.
+    Identity {
+        /// Number of the motor.
+        motor: u8,
+        /// Of its processor.
+        serial: [u8; 8],
+    },
+    /// Type 2, to every request but reads; or type 24, unasked.
+    Feedback(Feedback),
+    /// Type 17: a parameter.
+    Parameter {
+        /// Number of the motor.
+        motor: u8,
+        /// Which.
+        parameter: Parameter,
+        /// What it holds.
+        value: Value,
+    },
+    /// Type 21: its fault and warning words.
+    Fault {
+        /// Number of the motor.
+        motor: u8,
+        /// What is wrong, bits as in the manual.
+        faults: u32,
+        /// What soon is, bits as in the manual.
+        warnings: u32,
+    },
+}
+
+/// How a motor is and what it does.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Feedback {
+    /// Number of the motor.
+    pub motor: u8,
+    /// Whether it came unasked (type 24).
+    pub is_unasked: bool,
+    /// What it obeys.
+    pub mode: Mode,
+    /// What is wrong.
+    pub faults: Faults,
+    /// What it does.
+    pub motion: Motion,
+    /// Of the windings, tenths of a degree on the wire.
+    pub winding_celsius: f64,
+}
+
+/// The value of [`Parameter::Timeout`] for a time, rounded up so that no motor stops earlier than asked for; 0 never stops it.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within u32 by the check")]
+pub fn timeout(timeout_secs: f64) -> Result<Value, CanError> {
+    let upper = f64::from(u32::MAX) / TIMEOUT_TICKS_HZ;
+    match (0.0..=upper).contains(&timeout_secs) {
+        true if timeout_secs == 0.0 => Ok(Value::Whole(0)),
+        // Less a hair, so that whole ticks stay what they are; never 0, which would be for ever.
+        true => Ok(Value::Whole((timeout_secs * TIMEOUT_TICKS_HZ - 1e-6).ceil().max(1.0) as u32)),
+        false => Err(CanError::Range { field: "the timeout in seconds", value: timeout_secs, lower: 0.0, upper }),
+    }
+}
+
+/// The frame of a request from host number `host` to motor `motor`.
+pub fn encode_request(host: u8, motor: u8, request: &Request, limits: &Limits) -> Result<Frame, CanError> {
+    let host_only = u16::from(host);
+    let sealed = |last: u8| [SEAL[0], SEAL[1], SEAL[2], SEAL[3], SEAL[4], SEAL[5], last, 8];
+    let (kind, middle, bytes) = match *request {
+        Request::Identify => (Communication::Identity, host_only, [0; 8]),
+        Request::Move(command) => {
+            let scales = Scales::of(limits);
+            let [p1, p0] = scales.position.raw_from_value("the position", command.position_rad)?.to_be_bytes();
+            let [v1, v0] = scales.velocity.raw_from_value("the velocity", command.velocity_rad_s)?.to_be_bytes();
+            let [kp1, kp0] = scales.kp.raw_from_value("kp", command.kp_nm_rad)?.to_be_bytes();
+            let [kd1, kd0] = scales.kd.raw_from_value("kd", command.kd_nm_s_rad)?.to_be_bytes();
+            let torque = scales.torque.raw_from_value("the torque", command.torque_nm)?;
+            (Communication::Motion, torque, [p1, p0, v1, v0, kp1, kp0, kd1, kd0])
+        }
+        Request::Enable => (Communication::Enable, host_only, [0; 8]),
+        Request::Stop { clear_fault } => (Communication::Stop, host_only, [clear_fault.into(), 0, 0, 0, 0, 0, 0, 0]),
+        Request::SetZero => (Communication::SetZero, host_only, [1, 0, 0, 0, 0, 0, 0, 0]),
+        Request::Read(parameter) => (Communication::ReadParameter, host_only, parameter_bytes(parameter, [0; 4])),
+        Request::Write(parameter, value) => {
+            (Communication::WriteParameter, host_only, parameter_bytes(parameter, value_bytes(parameter, value)?))
+        }
+        Request::Store => (Communication::Store, host_only, sealed(7)),
+        Request::ReportActively(on) => (Communication::ActiveReport, host_only, sealed(on.into())),
+    };
+    Frame::classic(id_of(kind, middle, motor)?, &bytes)
+}
+
+/// Reads what a motor sends to host number `host`.
+pub fn decode_answer(frame: &Frame, host: u8, limits: &Limits) -> Result<Answer, CanError> {
+    let bytes = eight(frame, MESSAGE, true)?;
+    let [kind, flags, motor, to] = frame.id().value().to_be_bytes();
+    let foreign = CanError::Foreign { message: MESSAGE, id: frame.id().value() };
+    if kind == Communication::Identity as u8 {
+        return if to == EVERYONE { Ok(Answer::Identity { motor, serial: bytes }) } else { Err(foreign) };
+    }
+    if to != host {
+        return Err(foreign);
+    }
+    let [a, b, c, d, e, f, g, h] = bytes;
+    if kind == Communication::Feedback as u8 || kind == Communication::ActiveReport as u8 {
+        let mode = [Mode::Reset, Mode::Calibration, Mode::Run].into_iter().find(|mode| *mode as u8 == flags >> 6);
+        let scales = Scales::of(limits);
+        return Ok(Answer::Feedback(Feedback {
+            motor,
+            is_unasked: kind == Communication::ActiveReport as u8,
+            mode: mode.ok_or(CanError::Undefined { field: "the mode", raw: (flags >> 6).into() })?,
+            faults: Faults(flags & 0x3F),
+            motion: Motion {
+                position_rad: scales.position.value_from_raw(u16::from_be_bytes([a, b])),
+                velocity_rad_s: scales.velocity.value_from_raw(u16::from_be_bytes([c, d])),
+                torque_nm: scales.torque.value_from_raw(u16::from_be_bytes([e, f])),
+            },
+            winding_celsius: f64::from(u16::from_be_bytes([g, h])) / 10.0,
+        }));
+    }
+    if kind == Communication::ReadParameter as u8 {
+        let index = u16::from_le_bytes([a, b]);
+        if flags != 0 {
+            return Err(CanError::Refused { parameter: index.into() });
+        }
+        let parameter = Parameter::ALL.into_iter().find(|parameter| *parameter as u16 == index);
+        let parameter = parameter.ok_or(CanError::Undefined { field: "the parameter", raw: index.into() })?;
+        let value = match parameter.whole_bytes() {
+            Some(1) => Value::Whole(e.into()),
+            Some(2) => Value::Whole(u16::from_le_bytes([e, f]).into()),
+            Some(_) => Value::Whole(u32::from_le_bytes([e, f, g, h])),
+            None => Value::Real(f32::from_le_bytes([e, f, g, h])),
+        };
+        return Ok(Answer::Parameter { motor, parameter, value });
+    }
+    if kind == Communication::Fault as u8 {
+        let (faults, warnings) = (u32::from_le_bytes([a, b, c, d]), u32::from_le_bytes([e, f, g, h]));
+        return Ok(Answer::Fault { motor, faults, warnings });
+    }
+    Err(CanError::Undefined { field: "the communication type", raw: kind.into() })
+}
+
+/// The frame of a feedback to host number `host`, for motors that are simulated; the temperature must be 0 to 6553.5.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked to be within 16 bits first")]
+pub fn encode_feedback(host: u8, feedback: &Feedback, limits: &Limits) -> Result<Frame, CanError> {
+    let scales = Scales::of(limits);
+    let [a, b] = scales.position.raw_from_value("the position", feedback.motion.position_rad)?.to_be_bytes();
+    let [c, d] = scales.velocity.raw_from_value("the velocity", feedback.motion.velocity_rad_s)?.to_be_bytes();
+    let [e, f] = scales.torque.raw_from_value("the torque", feedback.motion.torque_nm)?.to_be_bytes();
+    let tenths = (feedback.winding_celsius * 10.0).round();
+    if !(0.0..=65_535.0).contains(&tenths) {
+        let value = feedback.winding_celsius;
+        return Err(CanError::Range { field: "the temperature", value, lower: 0.0, upper: 6553.5 });
+    }
+    let [g, h] = (tenths as u16).to_be_bytes();
+    let kind = if feedback.is_unasked { Communication::ActiveReport } else { Communication::Feedback };
+    let flags = (feedback.mode as u8) << 6 | (feedback.faults.0 & 0x3F);
+    Frame::classic(id_of(kind, u16::from_be_bytes([flags, feedback.motor]), host)?, &[a, b, c, d, e, f, g, h])
+}
+
+fn id_of(kind: Communication, middle: u16, to: u8) -> Result<Id, CanError> {
+    Id::extended(u32::from(kind as u8) << 24 | u32::from(middle) << 8 | u32::from(to))
+}
+
+fn parameter_bytes(parameter: Parameter, value: [u8; 4]) -> [u8; 8] {
+    let ([low, high], [a, b, c, d]) = ((parameter as u16).to_le_bytes(), value);
+    [low, high, 0, 0, a, b, c, d]
+}
+
+fn value_bytes(parameter: Parameter, value: Value) -> Result<[u8; 4], CanError> {
+    match (parameter.whole_bytes(), value) {
+        (Some(n_bytes), Value::Whole(whole)) if n_bytes == 4 || whole < 1 << (8 * n_bytes) => Ok(whole.to_le_bytes()),
+        (None, Value::Real(real)) if real.is_finite() => Ok(real.to_le_bytes()),
+        _ => Err(CanError::Undefined { field: "the value for the parameter", raw: parameter as u32 }),
+    }
+}
+
+/// All fields have 16 bits.
+struct Scales {
+    position: Scale,
+    velocity: Scale,
+    kp: Scale,
+    kd: Scale,
+    torque: Scale,
+}
+
+impl Scales {
+    fn of(limits: &Limits) -> Self {
+        Self {
+            position: Scale::symmetric(limits.position_rad, 16),
+            velocity: Scale::symmetric(limits.velocity_rad_s, 16),
+            kp: Scale::positive(limits.kp_nm_rad, 16),
+            kd: Scale::positive(limits.kd_nm_s_rad, 16),
+            torque: Scale::symmetric(limits.torque_nm, 16),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::{cut_and_doubled, random_frames};
+    use super::*;
+
+    const LIMITS: Limits = Model::Rs00.limits();
+    const HOST: u8 = 0xFD;
+
+    fn frame(id: u32, bytes: [u8; 8]) -> Frame {
+        Frame::classic(Id::extended(id).expect("29 bits"), &bytes).expect("classic")
+    }
+
+    #[test]
+    fn requests_are_the_makers_bytes() {
+        let still = Request::Move(Command::default());
+        let most =
+            Command { position_rad: 99.0, velocity_rad_s: 99.0, kp_nm_rad: 9e3, kd_nm_s_rad: 9.0, torque_nm: -99.0 };
+        for (request, id, bytes) in [
+            (Request::Identify, 0x0000_FD7F, [0; 8]),
+            (still, 0x017F_FF7F, [0x7F, 0xFF, 0x7F, 0xFF, 0, 0, 0, 0]),
+            (Request::Move(most), 0x0100_007F, [0xFF; 8]),
+            (Request::Enable, 0x0300_FD7F, [0; 8]),
+            (Request::Stop { clear_fault: false }, 0x0400_FD7F, [0; 8]),
+            (Request::Stop { clear_fault: true }, 0x0400_FD7F, [1, 0, 0, 0, 0, 0, 0, 0]),
+            (Request::SetZero, 0x0600_FD7F, [1, 0, 0, 0, 0, 0, 0, 0]),
+            // The manual's example of type 17.
+            (Request::Read(Parameter::PositionGain), 0x1100_FD7F, [0x1E, 0x70, 0, 0, 0, 0, 0, 0]),
+            (
+                Request::Write(Parameter::Timeout, timeout(1.0).expect("in range")),
+                0x1200_FD7F,
+                [0x28, 0x70, 0, 0, 0x20, 0x4E, 0, 0],
+            ),
+            (Request::Store, 0x1600_FD7F, [1, 2, 3, 4, 5, 6, 7, 8]),
+            (Request::ReportActively(true), 0x1800_FD7F, [1, 2, 3, 4, 5, 6, 1, 8]),
+        ] {
+            assert_eq!(encode_request(HOST, 0x7F, &request, &LIMITS), Ok(frame(id, bytes)), "{request:?}");
+        }
+    }
+
+    #[test]
+    fn answers_are_read() {
+        let read = |id, bytes| decode_answer(&frame(id, bytes), HOST, &LIMITS);
+        // The manual's example of type 17: loc_kp is 30.
+        let (parameter, value) = (Parameter::PositionGain, Value::Real(30.0));
+        let told = Answer::Parameter { motor: 0x7F, parameter, value };
+        assert_eq!(read(0x1100_7FFD, [0x1E, 0x70, 0, 0, 0, 0, 0xF0, 0x41]), Ok(told));
+        assert_eq!(read(0x1101_7FFD, [0x1E, 0x70, 0, 0, 0, 0, 0, 0]), Err(CanError::Refused { parameter: 0x701E }));
+        let mode = Answer::Parameter { motor: 1, parameter: Parameter::RunMode, value: Value::Whole(2) };
+        assert_eq!(read(0x1100_01FD, [0x05, 0x70, 0, 0, 2, 9, 9, 9]), Ok(mode));
+        assert_eq!(read(0x0000_05FE, [7; 8]), Ok(Answer::Identity { motor: 5, serial: [7; 8] }));
+        let fault = Answer::Fault { motor: 5, faults: 1 << 14, warnings: 1 };
+        assert_eq!(read(0x1500_05FD, [0, 0x40, 0, 0, 1, 0, 0, 0]), Ok(fault));
+
+        let motion = Motion { position_rad: 4.0 * PI, velocity_rad_s: -33.0, torque_nm: 14.0 };
+        for (kind, is_unasked) in [(0x02, false), (0x18, true)] {
+            let faults = Faults(Faults::UNCALIBRATED | Faults::UNDER_VOLTAGE);
+            let feedback = Feedback { motor: 0x11, is_unasked, mode: Mode::Run, faults, motion, winding_celsius: 30.5 };
+            let sent = frame(kind << 24 | 0x00A1_11FD, [0xFF, 0xFF, 0, 0, 0xFF, 0xFF, 0x01, 0x31]);
+            assert_eq!(decode_answer(&sent, HOST, &LIMITS), Ok(Answer::Feedback(feedback)));
+            assert_eq!(encode_feedback(HOST, &feedback, &LIMITS), Ok(sent));
+        }
+    }
+
+    #[test]
+    fn what_is_amiss_is_refused() {
+        let read = |id, bytes| decode_answer(&frame(id, bytes), HOST, &LIMITS);
+        assert!(matches!(read(0x0280_11FC, [0; 8]), Err(CanError::Foreign { .. })));
+        assert_eq!(read(0x02C0_11FD, [0; 8]), Err(CanError::Undefined { field: "the mode", raw: 3 }));
+        assert_eq!(read(0x1F00_11FD, [0; 8]), Err(CanError::Undefined { field: "the communication type", raw: 31 }));
+        assert_eq!(read(0x1100_11FD, [1; 8]), Err(CanError::Undefined { field: "the parameter", raw: 0x0101 }));
+        for bent in cut_and_doubled(&frame(0x0280_11FD, [0x80; 8])) {
+            assert!(matches!(decode_answer(&bent, HOST, &LIMITS), Err(CanError::Length { .. })));
+        }
+        let asked = |request| encode_request(HOST, 1, &request, &LIMITS);
+        assert!(asked(Request::Write(Parameter::RunMode, Value::Whole(256))).is_err());
+        assert!(asked(Request::Write(Parameter::RunMode, Value::Real(0.0))).is_err());
+        assert!(asked(Request::Write(Parameter::TorqueLimit, Value::Real(f32::NAN))).is_err());
+        let none = Command { torque_nm: f64::NAN, ..Command::default() };
+        assert_eq!(asked(Request::Move(none)), Err(CanError::NotFinite { field: "the torque" }));
+        for secs in [-1e-3, f64::NAN, f64::INFINITY, 1e9] {
+            assert!(matches!(timeout(secs), Err(CanError::Range { .. })), "{secs}");
+        }
+        for (secs, ticks) in [(0.0, 0), (1e-12, 1), (0.1, 2000), (1.0, 20_000)] {
+            assert_eq!(timeout(secs), Ok(Value::Whole(ticks)), "{secs}");
+        }
+    }
+
+    #[test]
+    fn random_frames_never_panic_and_feedback_is_made_again() {
+        let mut n_read = 0;
+        for frame in random_frames(17, Id::extended(0x0280_11FD).expect("29 bits")) {
+            if let Ok(Answer::Feedback(feedback)) = decode_answer(&frame, HOST, &LIMITS) {
+                n_read += 1;
+                assert_eq!(encode_feedback(HOST, &feedback, &LIMITS).expect("own").data(), frame.data());
+            }
+        }
+        assert!(n_read > 100, "{n_read}");
+    }
+
+    #[test]
+    fn every_models_ends_are_the_manuals() {
+        for (model, velocity_rad_s, torque_nm, kp, kd) in [
+            (Model::Rs00, 33.0, 14.0, 500.0, 5.0),
+            (Model::Rs01, 44.0, 17.0, 500.0, 5.0),
+            (Model::Rs02, 44.0, 17.0, 500.0, 5.0),
+            (Model::Rs03, 20.0, 60.0, 5000.0, 100.0),
+            (Model::Rs04, 15.0, 120.0, 5000.0, 100.0),
+            (Model::Rs05, 50.0, 5.5, 500.0, 5.0),
+            (Model::Rs06, 50.0, 36.0, 5000.0, 100.0),
+        ] {
+            let limits = Limits { position_rad: 4.0 * PI, velocity_rad_s, torque_nm, kp_nm_rad: kp, kd_nm_s_rad: kd };
+            assert_eq!(model.limits(), limits, "{model:?}");
+        }
+    }
+}

@@ -1,0 +1,89 @@
+//! The linear map between SI and unsigned counts that MIT packing and Robstride share.
+//!
+//! Source: `float_to_uint` and `uint_to_float` of Ben Katz's mini cheetah firmware, as in `cmjang/DM_Control_Python`: count 0 is the
+//! lower end, the highest count the upper. Their samples cut the fraction off; we take the nearest count, of two equally near the
+//! lower one, so that 0 in a symmetric range is sent as the same bytes as theirs.
+
+use super::CanError;
+
+/// What a field holds: a range and how many bits it is cut into.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Scale {
+    /// Value of count 0.
+    pub lower: f64,
+    /// Value of the highest count.
+    pub upper: f64,
+    /// Bits of the count, at most 16.
+    pub n_bits: u32,
+}
+
+impl Scale {
+    /// A range that is as wide below zero as above.
+    pub const fn symmetric(most: f64, n_bits: u32) -> Self {
+        Self { lower: -most, upper: most, n_bits }
+    }
+
+    /// A range that begins at zero.
+    pub const fn positive(most: f64, n_bits: u32) -> Self {
+        Self { lower: 0.0, upper: most, n_bits }
+    }
+
+    /// What one count more is worth.
+    pub fn step(&self) -> f64 {
+        (self.upper - self.lower) / self.most_raw()
+    }
+
+    /// The nearest count; values outside are clamped, no number is refused in the name of `field`.
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to at most 16 bits first")]
+    pub fn raw_from_value(&self, field: &'static str, value: f64) -> Result<u16, CanError> {
+        if value.is_nan() {
+            return Err(CanError::NotFinite { field });
+        }
+        let share = (value.clamp(self.lower, self.upper) - self.lower) / (self.upper - self.lower);
+        Ok((share * self.most_raw() - 0.5).ceil().clamp(0.0, self.most_raw()) as u16)
+    }
+
+    /// The value of a count.
+    pub fn value_from_raw(&self, raw: u16) -> f64 {
+        self.lower + f64::from(raw) * self.step()
+    }
+
+    fn most_raw(&self) -> f64 {
+        f64::from((1_u32 << self.n_bits) - 1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::Random;
+    use super::*;
+
+    #[test]
+    fn every_count_comes_back_and_every_value_within_half_a_step() {
+        for (most, n_bits) in [(12.5, 16), (30.0, 12), (0.7, 5)] {
+            for scale in [Scale::symmetric(most, n_bits), Scale::positive(most, n_bits)] {
+                for raw in 0..=u16::try_from((1_u32 << n_bits) - 1).expect("16 bits") {
+                    assert_eq!(scale.raw_from_value("x", scale.value_from_raw(raw)), Ok(raw));
+                }
+                let mut random = Random(7);
+                for _ in 0..10_000 {
+                    let value = scale.lower + random.share() * (scale.upper - scale.lower);
+                    let back = scale.value_from_raw(scale.raw_from_value("x", value).expect("a number"));
+                    // Half a step and the rounding of doubles.
+                    assert!((back - value).abs() <= scale.step() * (0.5 + 1e-9), "{value} {back}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn zero_is_the_makers_zero_and_the_ends_clamp() {
+        let scale = Scale::symmetric(12.5, 16);
+        for (value, raw) in
+            [(0.0, 0x7FFF), (12.5, 0xFFFF), (-12.5, 0), (99.0, 0xFFFF), (-99.0, 0), (f64::INFINITY, 0xFFFF)]
+        {
+            assert_eq!(scale.raw_from_value("x", value), Ok(raw), "{value}");
+        }
+        assert_eq!(scale.raw_from_value("position", f64::NAN), Err(CanError::NotFinite { field: "position" }));
+    }
+}

@@ -1,0 +1,249 @@
+//! CubeMars (T-Motor) AK motors in MIT mode.
+//!
+//! Sources: `neurobionics/TMotorCANControl` `mit_can.py` (limits, error codes, frames); CubeMars AK Series Module Product Manual,
+//! MIT mode (feedback, temperature less 40). The limits belong to the firmware: newer ones list others for some models, so they
+//! are data and a rig may give its own.
+
+use super::mit::{self, Command, Limits, Motion};
+use super::{CanError, Frame, Id};
+
+/// A model whose limits are known.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Model {
+    /// AK10-9.
+    Ak10x9,
+    /// AK60-6.
+    Ak60x6,
+    /// AK70-10.
+    Ak70x10,
+    /// AK80-6.
+    Ak80x6,
+    /// AK80-9.
+    Ak80x9,
+    /// AK80-64.
+    Ak80x64,
+}
+
+impl Model {
+    /// What its counts cover.
+    pub const fn limits(self) -> Limits {
+        match self {
+            Self::Ak10x9 => Limits::of(12.5, 50.0, 65.0),
+            Self::Ak60x6 => Limits::of(12.5, 50.0, 15.0),
+            Self::Ak70x10 => Limits::of(12.5, 50.0, 25.0),
+            Self::Ak80x6 => Limits::of(12.5, 76.0, 12.0),
+            Self::Ak80x9 => Limits::of(12.5, 50.0, 18.0),
+            Self::Ak80x64 => Limits::of(12.5, 8.0, 144.0),
+        }
+    }
+}
+
+/// An order without numbers: seven bytes `FF` and this one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Order {
+    /// Obey commands from now on.
+    Enable = 0xFC,
+    /// Let the shaft go.
+    Disable = 0xFD,
+    /// Take the present position as zero; the motor is deaf for about a second.
+    SetZero = 0xFE,
+}
+
+/// What is wrong with a motor.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Fault {
+    /// Nothing.
+    None = 0,
+    /// Too hot.
+    OverTemperature = 1,
+    /// Too much current.
+    OverCurrent = 2,
+    /// Supply too high.
+    OverVoltage = 3,
+    /// Supply too low.
+    UnderVoltage = 4,
+    /// The encoder fails.
+    Encoder = 5,
+    /// The phases' currents differ; the hardware may be damaged.
+    PhaseUnbalance = 6,
+}
+
+impl Fault {
+    const ALL: [Self; 7] = [
+        Self::None,
+        Self::OverTemperature,
+        Self::OverCurrent,
+        Self::OverVoltage,
+        Self::UnderVoltage,
+        Self::Encoder,
+        Self::PhaseUnbalance,
+    ];
+}
+
+/// How a firmware counts its temperature.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Thermometer {
+    /// Count 40 is 0 degrees Celsius: the manual.
+    Less40,
+    /// The count is degrees Celsius: what TMotorCANControl reads.
+    Plain,
+}
+
+/// The last two bytes of a feedback frame; firmware of 2020 and before leaves them out.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Health {
+    /// Of the drive, degrees Celsius.
+    pub drive_celsius: f64,
+    /// What is wrong.
+    pub fault: Fault,
+}
+
+/// What a motor answers to every frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Feedback {
+    /// Number of the motor.
+    pub motor: u8,
+    /// What it does.
+    pub motion: Motion,
+    /// How it is, where the firmware tells.
+    pub health: Option<Health>,
+}
+
+/// The frame of a command to motor `motor`.
+pub fn encode_command(motor: u8, command: &Command, limits: &Limits) -> Result<Frame, CanError> {
+    Frame::classic(Id::standard(motor.into())?, &mit::encode(command, limits)?)
+}
+
+/// The frame of an order to motor `motor`.
+pub fn encode_order(motor: u8, order: Order) -> Result<Frame, CanError> {
+    Frame::classic(Id::standard(motor.into())?, &[0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, order as u8])
+}
+
+/// Reads a motor's answer, of six or eight bytes.
+pub fn decode_feedback(frame: &Frame, limits: &Limits, thermometer: Thermometer) -> Result<Feedback, CanError> {
+    const MESSAGE: &str = "feedback of an AK motor";
+    if frame.is_remote() || frame.id().is_extended() {
+        return Err(CanError::Foreign { message: MESSAGE, id: frame.id().value() });
+    }
+    let (motor, motion, rest) = match *frame.data() {
+        [motor, a, b, c, d, e, ref rest @ ..] if rest.is_empty() || rest.len() == 2 => (motor, [a, b, c, d, e], rest),
+        ref other => return Err(CanError::Length { message: MESSAGE, got_bytes: other.len(), expected_bytes: 8 }),
+    };
+    let health = match *rest {
+        [temperature, code] => {
+            let zero = if thermometer == Thermometer::Less40 { 40.0 } else { 0.0 };
+            let undefined = CanError::Undefined { field: "the error code", raw: code.into() };
+            let fault = Fault::ALL.into_iter().find(|fault| *fault as u8 == code).ok_or(undefined)?;
+            Some(Health { drive_celsius: f64::from(temperature) - zero, fault })
+        }
+        _ => None,
+    };
+    Ok(Feedback { motor, motion: mit::decode_motion(motion, limits), health })
+}
+
+/// A motor's answer, for motors that are simulated; it goes to the host's identifier `host`, 0 by default.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked to be 0 to 255 first")]
+pub fn encode_feedback(
+    host: u8,
+    feedback: &Feedback,
+    limits: &Limits,
+    thermometer: Thermometer,
+) -> Result<Frame, CanError> {
+    let mut bytes = vec![feedback.motor];
+    bytes.extend(mit::encode_motion(&feedback.motion, limits)?);
+    if let Some(Health { drive_celsius, fault }) = feedback.health {
+        let zero = if thermometer == Thermometer::Less40 { 40.0 } else { 0.0 };
+        let count = (drive_celsius + zero).round();
+        if !(0.0..=255.0).contains(&count) {
+            let field = "the temperature";
+            return Err(CanError::Range { field, value: drive_celsius, lower: -zero, upper: 255.0 - zero });
+        }
+        bytes.extend([count as u8, fault as u8]);
+    }
+    Frame::classic(Id::standard(host.into())?, &bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::{cut_and_doubled, random_frames};
+    use super::*;
+
+    const LIMITS: Limits = Model::Ak80x9.limits();
+
+    fn frame(bytes: &[u8]) -> Frame {
+        Frame::classic(Id::standard(0).expect("small"), bytes).expect("classic")
+    }
+
+    #[test]
+    fn orders_and_commands_are_the_published_bytes() {
+        let enable = encode_order(1, Order::Enable).expect("a motor");
+        assert_eq!((enable.id().value(), enable.data()), (1, &[255, 255, 255, 255, 255, 255, 255, 0xFC][..]));
+        assert_eq!(encode_order(1, Order::Disable).expect("a motor").data()[7], 0xFD);
+        assert_eq!(encode_order(1, Order::SetZero).expect("a motor").data()[7], 0xFE);
+        let still = encode_command(104, &Command::default(), &LIMITS).expect("numbers");
+        assert_eq!((still.id().value(), still.data()), (104, &[0x7F, 0xFF, 0x7F, 0xF0, 0, 0, 0x07, 0xFF][..]));
+    }
+
+    #[test]
+    fn feedback_is_read_and_made_again() {
+        let bytes = [0x68, 0xFF, 0xFF, 0x00, 0x0F, 0xFF, 75, 2];
+        let feedback = decode_feedback(&frame(&bytes), &LIMITS, Thermometer::Less40).expect("feedback");
+        let motion = Motion { position_rad: 12.5, velocity_rad_s: -50.0, torque_nm: 18.0 };
+        let health = Some(Health { drive_celsius: 35.0, fault: Fault::OverCurrent });
+        assert_eq!(feedback, Feedback { motor: 0x68, motion, health });
+        assert_eq!(encode_feedback(0, &feedback, &LIMITS, Thermometer::Less40), Ok(frame(&bytes)));
+        let plain = decode_feedback(&frame(&bytes), &LIMITS, Thermometer::Plain).expect("feedback");
+        assert_eq!(plain.health.expect("eight bytes").drive_celsius, 75.0);
+        let short = decode_feedback(&frame(&bytes[..6]), &LIMITS, Thermometer::Less40).expect("feedback");
+        assert_eq!(short, Feedback { health: None, ..feedback });
+        assert_eq!(encode_feedback(0, &short, &LIMITS, Thermometer::Less40), Ok(frame(&bytes[..6])));
+    }
+
+    #[test]
+    fn what_is_amiss_is_refused() {
+        let whole = frame(&[1, 0x80, 0, 0x80, 0x08, 0, 65, 0]);
+        let read = |frame: &Frame| decode_feedback(frame, &LIMITS, Thermometer::Less40);
+        assert!(read(&whole).is_ok());
+        for bent in cut_and_doubled(&whole) {
+            assert_eq!(read(&bent).is_ok(), bent.data().len() == 6, "{bent:?}");
+        }
+        let undefined = CanError::Undefined { field: "the error code", raw: 7 };
+        assert_eq!(read(&frame(&[1, 0, 0, 0, 0, 0, 0, 7])), Err(undefined));
+        let own = Frame::remote(whole.id(), 8).expect("classic");
+        assert!(matches!(read(&own), Err(CanError::Foreign { .. })));
+        let hot = Feedback {
+            health: Some(Health { drive_celsius: 216.0, fault: Fault::None }),
+            ..read(&whole).expect("whole")
+        };
+        assert!(matches!(encode_feedback(0, &hot, &LIMITS, Thermometer::Less40), Err(CanError::Range { .. })));
+        let mut n_read = 0;
+        for frame in random_frames(11, whole.id()) {
+            if let Ok(feedback) = read(&frame) {
+                n_read += 1;
+                assert_eq!(
+                    encode_feedback(0, &feedback, &LIMITS, Thermometer::Less40).expect("own").data(),
+                    frame.data()
+                );
+            }
+        }
+        assert!(n_read > 100, "{n_read}");
+    }
+
+    #[test]
+    fn every_models_limits_hold_its_own_ends() {
+        for (model, velocity_rad_s, torque_nm) in [
+            (Model::Ak10x9, 50.0, 65.0),
+            (Model::Ak60x6, 50.0, 15.0),
+            (Model::Ak70x10, 50.0, 25.0),
+            (Model::Ak80x6, 76.0, 12.0),
+            (Model::Ak80x9, 50.0, 18.0),
+            (Model::Ak80x64, 8.0, 144.0),
+        ] {
+            let read = decode_feedback(&frame(&[1, 0, 0, 255, 255, 255]), &model.limits(), Thermometer::Less40);
+            let motion = Motion { position_rad: -12.5, velocity_rad_s, torque_nm };
+            assert_eq!(read, Ok(Feedback { motor: 1, motion, health: None }), "{model:?}");
+        }
+    }
+}
