@@ -37,7 +37,3 @@ fn color_from_field(frame: DepthFrame, point: vec3f) -> vec3f {
 fn ray_of(frame: DepthFrame, place_px: vec2f) -> vec3f {
     return vec3f((place_px - frame.depth_principal_px) / frame.depth_focal_px, 1.0);
 }
-
-fn folded(wg: vec3u, n_wgs: vec3u) -> u32 {
-    return wg.y * n_wgs.x + wg.x;
-}

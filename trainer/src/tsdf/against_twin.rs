@@ -1,8 +1,13 @@
 //! The kernels against their f64 twins, with optional features and without.
 
 use super::block::{Blocks, N_VOXELS, Place, stored_distance};
+use super::buffers::{Capacity, FieldBuffers};
 use super::chosen::Lattice;
-use super::reference::{self, Ray, VoxelBlocks};
+use super::kernels::Pipelines;
+use super::marching::{MeshBuffers, MeshRoom};
+use super::mesh::{BlockMesh, unit_of};
+use super::params::MeshVertex;
+use super::reference::{self, BlockTriangles, Ray, Vertex, VoxelBlocks};
 use super::tests::fuse_all;
 use super::{TsdfModel, TsdfOptions};
 use crate::gpu::{Gpu, GpuOptions};
@@ -11,7 +16,7 @@ use crate::test_scenes::{self as scenes, FOCAL_PX, PRINCIPAL_PX, SIZE_PX};
 use crate::{Keyframe, Method, RenderRequest};
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 /// What rounding of distances to 16 bits, and of weights to whole 256ths, may make over a few frames.
@@ -235,5 +240,65 @@ fn poisoned_depth_gives_no_blocks_and_the_rest_is_as_without_it() {
         fuse_all(&mut model);
         assert!(model.blocks().unwrap().is_empty());
         assert_eq!(model.progress().step, 3);
+    }
+}
+
+/// What f32 makes of places of a metre or two, metres.
+const PLACE_ABS_M: f64 = 1e-6;
+/// Normals are told in 16 bits a number.
+const NORMAL_ABS: f64 = 2e-4;
+/// Colors are told in 8 bits; one more where f32 rounds the other way.
+const MESH_COLOR_ABS: f64 = 0.51 / 255.0;
+
+fn edge_of(vertex: &Vertex) -> u32 {
+    let ([x, y, z], axis) = vertex.between;
+    u32::try_from(3 * (81 * z + 9 * y + x)).unwrap() + u32::try_from(axis).unwrap()
+}
+
+/// Every difference between a block's triangles and its twin's.
+fn compare_triangles(wrong: &mut Mismatches, place: Place, got: &BlockMesh, twin: &BlockTriangles) {
+    let edges = |corners: &[u32; 3]| corners.map(|ix| got.vertices[ix as usize].edge);
+    let got_edges: Vec<_> = got.triangles.iter().map(edges).collect();
+    let twin_edges: Vec<_> = twin.triangles.iter().map(|ixs| ixs.map(|ix| edge_of(&twin.vertices[ix]))).collect();
+    assert_eq!(got_edges, twin_edges, "{place:?}");
+    assert_eq!(got.vertices.len(), twin.vertices.len(), "{place:?}");
+    let by_edge: BTreeMap<u32, &MeshVertex> = got.vertices.iter().map(|vertex| (vertex.edge, vertex)).collect();
+    for expected in &twin.vertices {
+        let vertex = by_edge[&edge_of(expected)];
+        let color = vertex.color.to_le_bytes();
+        let normal = unit_of(vertex.normal);
+        for axis in 0..3 {
+            let told = |what: &str| format!("{what} {axis} at {place:?} {:?}", expected.between);
+            let along_m = f64::from(vertex.position_m[axis]);
+            wrong.check(told("place"), along_m, expected.position_m[axis], PLACE_ABS_M, 0.0);
+            wrong.check(told("normal"), f64::from(normal[axis]), expected.normal[axis], NORMAL_ABS, 0.0);
+            let part = f64::from(color[axis]) / 255.0;
+            wrong.check(told("color"), part, expected.color_srgb[axis], MESH_COLOR_ABS, 0.0);
+        }
+    }
+}
+
+#[test]
+fn triangles_are_those_of_the_twin() {
+    // The second does a few blocks at a time and has to make room first.
+    let rooms = [MeshRoom::default(), MeshRoom { n_blocks: 100, n_vertices: 1, n_triangles: 1 }];
+    for (options, room) in forms().into_iter().zip(rooms) {
+        let (blocks, lattice, _) = fused(&options, &scene());
+        let gpu = Gpu::open(&options).unwrap();
+        let pipelines = Pipelines::new(&gpu).unwrap();
+        let capacity = Capacity { n_blocks: 1, n_chunks: 64 };
+        let field = FieldBuffers::with_blocks(&gpu, &pipelines, &lattice, &blocks, capacity).unwrap();
+        let mut buffers = MeshBuffers::new(&gpu, room, field.capacity.n_blocks).unwrap();
+        assert!(buffers.of_changed(&gpu, &pipelines, &field).unwrap().is_empty(), "nothing changed");
+        field.mark_changed(&gpu, &blocks.keys().copied().collect()).unwrap();
+        let made = buffers.of_changed(&gpu, &pipelines, &field).unwrap();
+        let done: BTreeSet<Place> = made.iter().map(|(place, _)| *place).collect();
+        assert!(made.len() == blocks.len() && done.into_iter().eq(blocks.keys().copied()));
+        let mut wrong = Mismatches::default();
+        for (place, mesh) in &made {
+            compare_triangles(&mut wrong, *place, mesh, &reference::march(&blocks, *place, lattice.voxel_m));
+        }
+        assert!(made.iter().map(|(_, mesh)| mesh.triangles.len()).sum::<usize>() > 5000);
+        wrong.assert_none();
     }
 }

@@ -10,6 +10,7 @@
 #import field_status
 #import field_insert
 #import depth_frame
+#import folded
 
 @group(0) @binding(0) var<uniform> field: Field;
 @group(0) @binding(1) var<uniform> frame: DepthFrame;

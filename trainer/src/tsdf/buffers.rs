@@ -188,8 +188,20 @@ impl FieldBuffers {
     pub(crate) fn take_changed(&self, gpu: &Gpu) -> Result<Vec<Place>, Error> {
         let places = self.places(gpu)?;
         let changed: Vec<u32> = gpu.read(&self.changed, places.len())?;
-        gpu.clear(&self.changed, 0, self.changed.bytes());
+        self.forget_changed(gpu);
         Ok(places.into_iter().zip(changed).filter(|(_, flag)| *flag != 0).map(|(place, _)| place).collect())
+    }
+
+    /// Says that nothing changed.
+    pub(crate) fn forget_changed(&self, gpu: &Gpu) {
+        gpu.clear(&self.changed, 0, self.changed.bytes());
+    }
+
+    /// Says that these blocks changed, and no others.
+    pub(crate) fn mark_changed(&self, gpu: &Gpu, changed: &BTreeSet<Place>) -> Result<(), Error> {
+        let flags: Vec<u32> = self.places(gpu)?.iter().map(|place| u32::from(changed.contains(place))).collect();
+        gpu.write(&self.changed, 0, bytemuck::cast_slice(&flags));
+        Ok(())
     }
 
     /// Takes the blocks of `leaving` (slots, in order) out of the pool and puts `coming` in, which must

@@ -10,6 +10,7 @@
 #import picture_ray
 #import field
 #import field_status
+#import field_lookup
 
 struct Backdrop {
     srgb: vec4f,
@@ -39,28 +40,19 @@ var<private> known_slot: u32;
 
 // The row plus one; 0 where there is none.
 fn row_of(chunk: vec3i) -> u32 {
-    if all(chunk == known_chunk) { return known_row; }
-    known_chunk = chunk;
-    known_row = 0u;
-    if !chunk_in_range(chunk) { return 0u; }
-    let key = key_of(chunk);
-    var at = hash_of(key) & (field.n_chunk_slots - 1u);
-    for (var probe = 0u; probe < MAX_PROBES; probe++) {
-        let there = keys[at];
-        if there == key { known_row = at + 1u; }
-        if there == key || there == 0u { break; }
-        at = (at + 1u) & (field.n_chunk_slots - 1u);
+    if any(chunk != known_chunk) {
+        known_chunk = chunk;
+        known_row = find_row(chunk);
     }
     return known_row;
 }
 
 // The slot plus one; 0 where there is none.
 fn slot_of(block: vec3i) -> u32 {
-    if all(block == known_block) { return known_slot; }
-    known_block = block;
-    known_slot = 0u;
-    let row = row_of(block >> vec3u(3u));
-    if row != 0u { known_slot = entries[(row - 1u) * BLOCK_VOXELS + voxel_in_block(block)]; }
+    if any(block != known_block) {
+        known_block = block;
+        known_slot = slot_in_row(row_of(block >> vec3u(3u)), block);
+    }
     return known_slot;
 }
 

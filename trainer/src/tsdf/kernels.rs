@@ -15,6 +15,10 @@ const SHARED: &[Source] = &[
     source!("field"),
     source!("field_status"),
     source!("field_insert"),
+    source!("field_lookup"),
+    source!("folded"),
+    source!("mesh_work"),
+    source!("scan"),
     source!("depth_frame"),
 ];
 
@@ -34,6 +38,8 @@ pub const KERNELS: &[Kernel] = &[
     kernel!("end_frame"),
     kernel!("gather_blocks"),
     kernel!("cast_rays"),
+    kernel!("list_due"),
+    kernel!("march_cubes"),
 ];
 
 /// All of them, compiled.
@@ -47,6 +53,8 @@ pub(crate) struct Pipelines {
     pub(crate) end_frame: Pipeline,
     pub(crate) gather_blocks: Pipeline,
     pub(crate) cast_rays: Pipeline,
+    pub(crate) list_due: Pipeline,
+    pub(crate) march_cubes: Pipeline,
 }
 
 impl Pipelines {
@@ -60,6 +68,8 @@ impl Pipelines {
             end_frame: Pipeline::new(gpu, kernel!("end_frame"), &[])?,
             gather_blocks: Pipeline::new(gpu, kernel!("gather_blocks"), &[])?,
             cast_rays: Pipeline::new(gpu, kernel!("cast_rays"), &[])?,
+            list_due: Pipeline::new(gpu, kernel!("list_due"), &[])?,
+            march_cubes: Pipeline::new(gpu, kernel!("march_cubes"), &[])?,
         })
     }
 }
@@ -68,7 +78,7 @@ impl Pipelines {
 mod tests {
     use crate::gpu::{reflect, resolve};
     use crate::splat::View;
-    use crate::tsdf::params::{Backdrop, DepthFrame, Field};
+    use crate::tsdf::params::{Backdrop, DepthFrame, Field, MeshPart, MeshPiece, MeshVertex};
 
     /// Names and offsets of a struct's fields and its size, as WGSL lays it out in every kernel that knows it.
     fn layout_in_wgsl(name: &str) -> (Vec<(String, usize)>, usize) {
@@ -121,6 +131,9 @@ mod tests {
             ]
         );
         assert_layout!(Backdrop, [srgb]);
+        assert_layout!(MeshPiece, [first, n_most]);
+        assert_layout!(MeshPart, [place, first_vertex, n_vertices, first_triangle, n_triangles]);
+        assert_layout!(MeshVertex, [position_m, edge, normal, color]);
         assert_eq!(layout_in_wgsl("View").1, size_of::<View>());
     }
 

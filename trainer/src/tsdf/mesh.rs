@@ -3,12 +3,14 @@
 mod cases;
 mod cluster;
 mod glb;
-mod march;
 mod mesher;
 mod ply;
 
+pub(super) use cases::CASES;
 pub use glb::write as write_glb;
-pub use mesher::Mesher;
+#[cfg(test)]
+pub(super) use mesher::unit_of;
+pub(super) use mesher::{BlockMesh, Mesher};
 pub use ply::write as write_ply;
 
 #[cfg(test)]

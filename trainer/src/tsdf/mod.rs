@@ -6,6 +6,7 @@ pub mod block;
 mod buffers;
 mod chosen;
 pub mod kernels;
+mod marching;
 pub mod mesh;
 mod model;
 mod options;

@@ -2,13 +2,15 @@
 
 mod budget;
 mod checkpoint;
+mod meshing;
 mod saving;
 
 use super::block::{Blocks, Place};
 use super::buffers::{self, Capacity, FieldBuffers};
 use super::chosen::Lattice;
 use super::kernels::Pipelines;
-use super::mesh::{Mesh, Mesher};
+use super::marching::MeshBuffers;
+use super::mesh::Mesher;
 use super::options::TsdfOptions;
 use super::params::{DepthFrame, status};
 use super::passes::{self, Canvas, FrameSlot};
@@ -50,9 +52,10 @@ pub struct TsdfModel {
     in_flight: Option<InFlight>,
     /// Blocks that found no room on the GPU.
     waiting: Blocks,
-    /// Blocks that changed since the mesh was made.
+    /// Blocks that changed since the mesh was made, besides those that the GPU has flags for.
     due: BTreeSet<Place>,
     mesher: Mesher,
+    mesh_buffers: Option<MeshBuffers>,
     n_resident: u32,
     n_refused: u64,
     n_outside: u32,
@@ -86,6 +89,7 @@ impl TsdfModel {
             waiting: Blocks::new(),
             due: BTreeSet::new(),
             mesher: Mesher::default(),
+            mesh_buffers: None,
             n_resident: 0,
             n_refused: 0,
             n_outside: 0,
@@ -130,28 +134,6 @@ impl TsdfModel {
             blocks.extend(field.read_all(&self.gpu, &self.pipelines)?);
         }
         Ok(blocks)
-    }
-
-    /// The surface in world as it is now; only what changed since the last call is made anew.
-    pub fn mesh(&mut self) -> Result<Mesh, Error> {
-        self.update_mesh()?;
-        Ok(self.lattice.as_ref().map_or_else(Mesh::default, |lattice| self.mesher.mesh(lattice)))
-    }
-
-    /// Makes the triangles of what changed since the last call, without joining them to one mesh; says how many blocks it were.
-    pub fn update_mesh(&mut self) -> Result<usize, Error> {
-        self.settle()?;
-        let (Some(lattice), Some(field)) = (&self.lattice, &self.field) else { return Ok(0) };
-        self.due.extend(field.take_changed(&self.gpu)?);
-        let places = field.places(&self.gpu)?;
-        let slots: Vec<u32> =
-            (0..).zip(&places).filter(|(_, place)| self.due.contains(*place)).map(|(slot, _)| slot).collect();
-        let blocks = field.read(&self.gpu, &self.pipelines, &slots)?;
-        let resident = slots.iter().map(|slot| places[*slot as usize]).zip(blocks);
-        let waiting = self.due.iter().filter_map(|place| Some((*place, self.waiting.get(place)?.clone())));
-        let changed: Blocks = waiting.chain(resident).collect();
-        self.due.clear();
-        Ok(self.mesher.update(lattice, changed))
     }
 
     /// Most blocks the GPU may hold.

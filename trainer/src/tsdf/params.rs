@@ -98,6 +98,35 @@ pub(crate) struct Backdrop {
     pub(crate) srgb: [f32; 4],
 }
 
+/// `MeshPiece` of `shared/mesh_work.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct MeshPiece {
+    pub(crate) first: u32,
+    pub(crate) n_most: u32,
+}
+
+/// `MeshPart` of `shared/mesh_work.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct MeshPart {
+    pub(crate) place: [i32; 3],
+    pub(crate) first_vertex: u32,
+    pub(crate) n_vertices: u32,
+    pub(crate) first_triangle: u32,
+    pub(crate) n_triangles: u32,
+}
+
+/// `MeshVertex` of `shared/mesh_work.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct MeshVertex {
+    pub(crate) position_m: [f32; 3],
+    pub(crate) edge: u32,
+    pub(crate) normal: u32,
+    pub(crate) color: u32,
+}
+
 /// Indices into the status array, as in `shared/field_status.wgsl`.
 pub(crate) mod status {
     pub(crate) const N_BLOCKS: usize = 0;

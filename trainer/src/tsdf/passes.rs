@@ -2,6 +2,7 @@
 
 use super::buffers::FieldBuffers;
 use super::kernels::Pipelines;
+use super::marching::MeshBuffers;
 use super::params::{Backdrop, DepthFrame};
 use crate::gpu::{Buffer, Gpu, Passes};
 use crate::splat::View;
@@ -134,6 +135,60 @@ pub(crate) fn gather(
             ("colors", &buffers.colors),
             ("gathered_geometry", geometry),
             ("gathered_colors", colors),
+        ],
+    );
+}
+
+/// Lists the blocks whose triangles may be others than before.
+pub(crate) fn list_due(
+    gpu: &Gpu,
+    list: &mut Passes,
+    pipelines: &Pipelines,
+    buffers: &FieldBuffers,
+    mesh: &MeshBuffers,
+) {
+    let FieldBuffers { capacity, field, status, keys, entries, coords, changed, .. } = buffers;
+    list.clear(&mesh.is_due);
+    list.clear_range(&mesh.due, 0..4);
+    list.dispatch(
+        gpu,
+        &pipelines.list_due,
+        capacity.n_blocks.into(),
+        &[
+            ("field", field),
+            ("status", status),
+            ("coords", coords),
+            ("changed", changed),
+            ("keys", keys),
+            ("entries", entries),
+            ("is_due", &mesh.is_due),
+            ("due", &mesh.due),
+        ],
+    );
+}
+
+/// Makes the triangles of a piece of the list.
+pub(crate) fn march(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers: &FieldBuffers, mesh: &MeshBuffers) {
+    let FieldBuffers { capacity, field, keys, entries, coords, geometry, colors, .. } = buffers;
+    list.clear(&mesh.needed);
+    list.dispatch(
+        gpu,
+        &pipelines.march_cubes,
+        capacity.n_blocks.min(mesh.room.n_blocks).into(),
+        &[
+            ("field", field),
+            ("piece", &mesh.piece),
+            ("coords", coords),
+            ("keys", keys),
+            ("entries", entries),
+            ("geometry", geometry),
+            ("colors", colors),
+            ("cases", &mesh.cases),
+            ("due", &mesh.due),
+            ("room", &mesh.needed),
+            ("parts", &mesh.parts),
+            ("vertices", &mesh.vertices),
+            ("triangles", &mesh.triangles),
         ],
     );
 }

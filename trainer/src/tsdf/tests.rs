@@ -488,6 +488,9 @@ fn frame_of_640x480() {
     for ix in 12..16 {
         model.push(frame(ix)).unwrap();
         fuse_all(&mut model);
+        let timings = model.profile_mesh().unwrap();
+        let sum: f64 = timings.iter().map(|timing| timing.millis).sum();
+        eprintln!("{:?} {sum:.3} ms", timings.iter().map(|timing| (timing.name, timing.millis)).collect::<Vec<_>>());
         let begin = std::time::Instant::now();
         let n = model.update_mesh().unwrap();
         let updated = begin.elapsed().as_secs_f64() * 1e3;

@@ -7,13 +7,13 @@ use std::sync::LazyLock;
 
 /// A cube's edge: the corner it begins at, as bits x, y, z, and the axis it runs along.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Edge {
-    pub(super) corner: usize,
-    pub(super) axis: usize,
+pub(in crate::tsdf) struct Edge {
+    pub(in crate::tsdf) corner: usize,
+    pub(in crate::tsdf) axis: usize,
 }
 
 /// Triangles of each case, as edges; bit c of a case's number says that corner c is inside.
-pub(super) static CASES: LazyLock<[Vec<[Edge; 3]>; 256]> = LazyLock::new(|| std::array::from_fn(triangles));
+pub(in crate::tsdf) static CASES: LazyLock<[Vec<[Edge; 3]>; 256]> = LazyLock::new(|| std::array::from_fn(triangles));
 
 /// Corners of the six faces, counterclockwise as seen from outside.
 const FACES: [[usize; 4]; 6] = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];

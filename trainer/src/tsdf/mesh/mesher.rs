@@ -1,57 +1,52 @@
-//! A mesh that follows a field: only blocks that changed, and those beside them, are done again.
+//! A mesh that follows a field: the triangles of its blocks, joined when the whole is asked for.
 
 use super::Mesh;
-use super::march::{BlockMesh, Key, march};
-use crate::tsdf::block::{BLOCK_EDGE, Blocks, Place};
+use crate::gpu::f32_of;
+use crate::tsdf::block::{BLOCK_EDGE, Place};
 use crate::tsdf::chosen::Lattice;
-use rayon::prelude::*;
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use crate::tsdf::params::MeshVertex;
+use nalgebra::Vector3;
+use std::collections::{BTreeMap, HashMap};
 
-/// The blocks as they were told last, and their triangles.
+/// The triangles of the cubes whose lowest corner lies in one block.
+#[derive(Debug)]
+pub(in crate::tsdf) struct BlockMesh {
+    pub(in crate::tsdf) vertices: Vec<MeshVertex>,
+    pub(in crate::tsdf) triangles: Vec<[u32; 3]>,
+}
+
+/// The triangles of blocks as they were made last.
 #[derive(Debug, Default)]
-pub struct Mesher {
-    blocks: Blocks,
+pub(in crate::tsdf) struct Mesher {
     meshes: BTreeMap<Place, BlockMesh>,
 }
 
 impl Mesher {
-    /// Takes blocks that are new or changed; says how many were done again.
-    pub fn update(&mut self, lattice: &Lattice, changed: Blocks) -> usize {
-        let mut due = BTreeSet::new();
-        for [x, y, z] in changed.keys() {
-            for ix in 0..27 {
-                due.insert([x + ix % 3 - 1, y + ix / 3 % 3 - 1, z + ix / 9 - 1]);
-            }
-        }
-        self.blocks.extend(changed);
-        let due: Vec<Place> = due.into_iter().filter(|place| self.blocks.contains_key(place)).collect();
-        let made: Vec<BlockMesh> = due.par_iter().map(|place| march(&self.blocks, *place, lattice.voxel_m)).collect();
-        let n = due.len();
-        for (place, mesh) in due.into_iter().zip(made) {
+    /// Takes what blocks have now in place of what they had.
+    pub(in crate::tsdf) fn replace(&mut self, made: impl IntoIterator<Item = (Place, BlockMesh)>) {
+        for (place, mesh) in made {
             if mesh.triangles.is_empty() {
                 self.meshes.remove(&place);
             } else {
                 self.meshes.insert(place, mesh);
             }
         }
-        n
     }
 
     /// All triangles, in order of their blocks; a vertex that blocks share is there once.
-    pub fn mesh(&self, lattice: &Lattice) -> Mesh {
+    pub(in crate::tsdf) fn mesh(&self, lattice: &Lattice) -> Mesh {
         let mut whole = Mesh { origin_m: lattice.anchor_m, ..Mesh::default() };
-        let mut known: HashMap<Key, u32> = HashMap::new();
+        let mut known: HashMap<(Place, u32), u32> = HashMap::new();
         for (place, mesh) in &self.meshes {
-            let is_shared =
-                |(voxel, _): &Key| (0..3).any(|axis| matches!(voxel[axis] - BLOCK_EDGE * place[axis], 0 | BLOCK_EDGE));
-            let mut places = Vec::with_capacity(mesh.keys.len());
-            for (ix, key) in mesh.keys.iter().enumerate() {
+            let mut places = Vec::with_capacity(mesh.vertices.len());
+            for vertex in &mesh.vertices {
                 let next = u32::try_from(whole.positions_m.len()).unwrap_or(u32::MAX);
-                let at = if is_shared(key) { *known.entry(*key).or_insert(next) } else { next };
+                let at = shared_key(*place, vertex.edge).map_or(next, |key| *known.entry(key).or_insert(next));
                 if at == next {
-                    whole.positions_m.push(mesh.positions_m[ix]);
-                    whole.normals.push(mesh.normals[ix]);
-                    whole.colors_srgb.push(mesh.colors_srgb[ix]);
+                    whole.positions_m.push(vertex.position_m);
+                    whole.normals.push(unit_of(vertex.normal));
+                    let [red, green, blue, _] = vertex.color.to_le_bytes();
+                    whole.colors_srgb.push([red, green, blue]);
                 }
                 places.push(at);
             }
@@ -59,4 +54,22 @@ impl Mesher {
         }
         whole
     }
+}
+
+/// Names an edge that may belong to several blocks: its first voxel in the field, and its axis.
+fn shared_key(block: Place, edge: u32) -> Option<(Place, u32)> {
+    let local = [edge / 3 % 9, edge / 27 % 9, edge / 243].map(u32::cast_signed);
+    let is_shared = local.iter().any(|along| matches!(*along, 0 | BLOCK_EDGE));
+    is_shared.then(|| (std::array::from_fn(|axis| BLOCK_EDGE * block[axis] + local[axis]), edge % 3))
+}
+
+/// The direction that two numbers of an octahedron's map stand for.
+///
+/// Source: Cigolle et al. 2014, "A survey of efficient representations for independent unit vectors", section 3.
+pub(in crate::tsdf) fn unit_of(octahedral: u32) -> [f32; 3] {
+    let [low, high] = [octahedral, octahedral >> 16].map(|half| f64::from(half as u16 as i16) / 32767.0);
+    let up = 1.0 - low.abs() - high.abs();
+    let [x, y] =
+        if up < 0.0 { [(1.0 - high.abs()) * low.signum(), (1.0 - low.abs()) * high.signum()] } else { [low, high] };
+    Vector3::new(x, y, up).normalize().map(f32_of).into()
 }

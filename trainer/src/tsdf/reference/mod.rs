@@ -3,9 +3,11 @@
 mod allocate;
 mod cast;
 mod integrate;
+mod march;
 mod readings;
 
 pub use allocate::{Wanted, wanted_blocks};
 pub use cast::{Hit, Ray, cast};
 pub use integrate::{Voxel, VoxelBlocks, integrate, unseen};
+pub use march::{BlockTriangles, Vertex, march};
 pub use readings::{Reading, readings};

@@ -1,0 +1,34 @@
+// list_due: lists the blocks whose triangles may be others than before: those that changed and all beside them, whose
+// cubes and normals read their voxels. The list's order is a matter of luck; each block is worked on by itself.
+//
+// groups    one per block of the pool; 32 threads, 27 of them for the block or a neighbor each
+// reads     field, status, coords, changed, keys, entries
+// writes    is_due [n_block_slots] (all 0 before), due [1 + n_due] (how many, 0 before; then slots)
+// twin      none: mesh/tests.rs compares a mesh that followed with one made at once
+
+#import field
+#import field_status
+#import field_lookup
+#import folded
+
+@group(0) @binding(0) var<uniform> field: Field;
+@group(0) @binding(1) var<storage, read> status: array<u32>;
+@group(0) @binding(2) var<storage, read> coords: array<vec4i>;
+@group(0) @binding(3) var<storage, read> changed: array<u32>;
+@group(0) @binding(4) var<storage, read> keys: array<u32>;
+@group(0) @binding(5) var<storage, read> entries: array<u32>;
+@group(0) @binding(6) var<storage, read_write> is_due: array<atomic<u32>>;
+@group(0) @binding(7) var<storage, read_write> due: array<atomic<u32>>;
+
+@compute @workgroup_size(32)
+fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let at = folded(wg, n_wgs);
+    if at >= min(status[N_BLOCKS], field.n_block_slots) || lane >= 27u { return; } // Allowed here: no barrier below.
+    if changed[at] == 0u { return; }
+    let slot = find_slot(coords[at].xyz + around(lane));
+    if slot == 0u { return; }
+    if atomicExchange(&is_due[slot - 1u], 1u) == 0u {
+        let ix = atomicAdd(&due[0], 1u);
+        atomicStore(&due[1u + ix], slot - 1u);
+    }
+}
