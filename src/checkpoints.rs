@@ -2,6 +2,7 @@
 
 use crate::run_folder::{CHECKPOINT, expect_one_model};
 use anyhow::Context;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -27,11 +28,19 @@ pub(crate) fn read(folder: &Path) -> anyhow::Result<Checkpoint> {
     Checkpoint::read(&folder.join(CHECKPOINT)).with_context(|| format!("nothing to go on from in {}", folder.display()))
 }
 
+/// What checkpoints say of the data.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct OfData {
+    /// SHA-256 of the model that depth was drawn from.
+    pub(crate) depth_from: Option<String>,
+    /// Flags that keyframes were made by.
+    pub(crate) flags: BTreeMap<String, String>,
+}
+
 /// The checkpoints of one run; each replaces the one before.
 pub(crate) struct Checkpoints {
     path: PathBuf,
-    /// SHA-256 of the model that depth was drawn from.
-    depth_from: Option<String>,
+    of_data: OfData,
     every: Duration,
     last: Instant,
     writing: Option<JoinHandle<Result<(), trainer::Error>>>,
@@ -41,12 +50,18 @@ impl Checkpoints {
     /// None where they are not wanted. The first is due after the time between two.
     pub(crate) fn new(folder: &Path, args: CheckpointArgs) -> Option<Self> {
         let (every, path) = (args.checkpoint_secs, folder.join(CHECKPOINT));
-        (!every.is_zero()).then(|| Self { path, depth_from: None, every, last: Instant::now(), writing: None })
+        (!every.is_zero()).then(|| Self {
+            path,
+            of_data: OfData::default(),
+            every,
+            last: Instant::now(),
+            writing: None,
+        })
     }
 
-    /// Says in each whose depth was drawn, by the SHA-256 of that model.
-    pub(crate) fn with_depth_from(self, sha256: Option<String>) -> Self {
-        Self { depth_from: sha256, ..self }
+    /// Says this in each.
+    pub(crate) fn with_data(self, of_data: OfData) -> Self {
+        Self { of_data, ..self }
     }
 
     /// Begins one when it is due and the one before is written, and says so. A disk that refuses one does not stop training.
@@ -69,8 +84,8 @@ impl Checkpoints {
         let asked = Instant::now();
         let pending = method.checkpoint()?;
         log::debug!("a checkpoint held training up for {:?}", asked.elapsed());
-        let (path, depth_from) = (self.path.clone(), self.depth_from.clone());
-        self.writing = Some(std::thread::spawn(move || write(pending, seconds, depth_from, &path)));
+        let (path, of_data) = (self.path.clone(), self.of_data.clone());
+        self.writing = Some(std::thread::spawn(move || write(pending, seconds, of_data, &path)));
         self.last = Instant::now();
         Ok(())
     }
@@ -85,14 +100,10 @@ impl Checkpoints {
     }
 }
 
-fn write(
-    pending: PendingCheckpoint,
-    seconds: f64,
-    depth_from: Option<String>,
-    path: &Path,
-) -> Result<(), trainer::Error> {
+fn write(pending: PendingCheckpoint, seconds: f64, of_data: OfData, path: &Path) -> Result<(), trainer::Error> {
     let begun = Instant::now();
-    Checkpoint { seconds, depth_from, ..pending.finish()? }.write(path)?;
+    let OfData { depth_from, flags: data_flags } = of_data;
+    Checkpoint { seconds, depth_from, data_flags, ..pending.finish()? }.write(path)?;
     log::debug!("a checkpoint was written in {:?}", begun.elapsed());
     Ok(())
 }

@@ -6,9 +6,11 @@ use crate::depth_from::{DepthSource, DrawnDepth};
 use crate::exit::{BadArgument, LackOfEvidence};
 use crate::holdout::Holdout;
 use crate::join::{Join, JoinEvent, KeyframeList, Use};
+use crate::method::Kind;
 use crate::open::{self, Opened};
 use crate::stands::{StandReport, Stands};
 use crate::{print, shrink};
+use anyhow::ensure;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -34,6 +36,60 @@ pub(crate) struct DataArgs {
     /// Shrink the images (not their depth) to this share of their width and height, 0.05 to 1 [default: the rig file's, else 1]
     #[arg(long, value_name = "SHARE", value_parser = shrink::share)]
     pub(crate) scale: Option<f64>,
+}
+
+impl DataArgs {
+    /// What is given of the flags that keyframes are made by: values by names, files by their whole path.
+    pub(crate) fn flags(&self) -> BTreeMap<String, String> {
+        let whole = |file: &Path| file.canonicalize().unwrap_or_else(|_| file.to_owned()).display().to_string();
+        let holdout = |text: &String| if is_number(text) { text.clone() } else { whole(Path::new(text)) };
+        let given = [
+            ("holdout", self.holdout.as_ref().map(holdout)),
+            ("keyframes", self.keyframes.as_deref().map(whole)),
+            ("rig", self.rig.as_deref().map(whole)),
+            ("scale", self.scale.map(|scale| scale.to_string())),
+        ];
+        given.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?))).collect()
+    }
+
+    /// These flags, and where they say nothing those that keyframes were made by `before`. A number that says otherwise is refused;
+    /// a file may have moved: what it makes has to be the same, and is compared later.
+    ///
+    /// `whose`: what was made before.
+    pub(crate) fn after(&self, whose: &str, before: &BTreeMap<String, String>) -> Result<Self, BadArgument> {
+        let now = self.flags();
+        for (name, value) in before {
+            let is_other = |now: &String| now != value && is_number(now) && is_number(value);
+            if let Some(now) = now.get(name).filter(|now| is_other(now)) {
+                return Err(BadArgument(format!("--{name} {now}: {whose} is of images with --{name} {value}")));
+            }
+        }
+        let left = |name: &str| before.get(name).filter(|_| !now.contains_key(name));
+        // Both say which images there are: one given stands for both.
+        let which = |name: &str| left(name).filter(|_| self.holdout.is_none() && self.keyframes.is_none());
+        let scale = left("scale").map(|scale| scale.parse());
+        let scale = scale.transpose().map_err(|_| BadArgument(format!("{whose}: its scale is no number")))?;
+        let restored = Self {
+            holdout: self.holdout.clone().or(which("holdout").cloned()),
+            keyframes: self.keyframes.clone().or(which("keyframes").map(PathBuf::from)),
+            rig: self.rig.clone().or(left("rig").map(PathBuf::from)),
+            scale: self.scale.or(scale),
+        };
+        let told: Vec<String> = restored
+            .flags()
+            .iter()
+            .filter(|(name, _)| !now.contains_key(*name))
+            .map(|(name, value)| format!("--{name} {value}"))
+            .collect();
+        if !told.is_empty() {
+            log::info!("{}, as {whose} was trained with", told.join(" "));
+        }
+        Ok(restored)
+    }
+}
+
+fn is_number(text: &str) -> bool {
+    text.parse::<f64>().is_ok()
 }
 
 /// Keyframes and what to know of them.
@@ -118,7 +174,8 @@ impl Data {
         quiet: bool,
     ) -> anyhow::Result<Self> {
         let Selection { list, holdout, scale, rig, as_told } = selection;
-        let is_recording = path.extension().is_some_and(|ending| ending == RECORDING_ENDING);
+        expect(path)?;
+        let is_recording = is_recording(path);
         let mut data = if is_recording {
             let scale = scale.map(|scale| Override::new("train.scale", scale));
             let overrides: Vec<Override> = overrides.iter().cloned().chain(scale).collect();
@@ -150,6 +207,12 @@ impl Data {
     pub(crate) fn rig_as_given(path: &Path, args: &DataArgs) -> anyhow::Result<Rig> {
         let rig = args.rig.as_deref().map(|file| Rig::load(file, &[])).transpose()?;
         Ok(open::recording(path, rig, &[])?.rig)
+    }
+
+    /// The scene models that data are for where no flag says: a recording's rig file names them, before anything else is read.
+    pub(crate) fn usual_kinds(path: &Path, args: &DataArgs) -> anyhow::Result<Vec<Kind>> {
+        expect(path)?;
+        Ok(if is_recording(path) { Self::rig_as_given(path, args)?.train.methods } else { vec![Kind::Splat] })
     }
 
     /// Keyframes of one split.
@@ -287,7 +350,39 @@ impl Data {
     }
 }
 
+/// Refuses data that are not there.
+pub(crate) fn expect(path: &Path) -> anyhow::Result<()> {
+    ensure!(path.exists(), "{} does not exist", path.display());
+    Ok(())
+}
+
+/// Whether the name is that of a recording.
+pub(crate) fn is_recording(path: &Path) -> bool {
+    path.extension().is_some_and(|ending| ending == RECORDING_ENDING)
+}
+
 /// Name of a recorded image: camera and stamp.
 fn name(keyframe: &Keyframe) -> String {
     format!("{}/{}", keyframe.camera, keyframe.stamp.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_flags_leave_open_is_as_it_was() {
+        let none = DataArgs { holdout: None, keyframes: None, rig: None, scale: None };
+        let first = DataArgs { holdout: Some("5".into()), scale: Some(0.25), ..none.clone() };
+        let again = |args: &DataArgs| args.after("the checkpoint", &first.flags());
+        assert_eq!(again(&none).expect("nothing is said").flags(), first.flags());
+        let listed = DataArgs { keyframes: Some("other.txt".into()), ..none.clone() };
+        let names: Vec<String> = again(&listed).expect("a list is compared later").flags().into_keys().collect();
+        assert_eq!(names, ["keyframes", "scale"]);
+        let same = DataArgs { scale: Some(0.25), ..none.clone() };
+        assert_eq!(again(&same).expect("the same").flags(), first.flags());
+        let other = again(&DataArgs { scale: Some(0.5), ..none.clone() }).expect_err("another").0;
+        assert_eq!(other, "--scale 0.5: the checkpoint is of images with --scale 0.25");
+        assert!(again(&DataArgs { holdout: Some("2".into()), ..none }).is_err());
+    }
 }

@@ -1,5 +1,6 @@
 //! Depth for images that have none, drawn from a saved model where they were taken: `--depth-from`.
 
+use crate::evaluate::{LEAST_ALPHA, LEAST_SEEN_FRAC, OTHER_PLACE};
 use crate::exit::{BadArgument, LackOfEvidence};
 use crate::{evaluate, method, print, run_folder};
 use anyhow::Context;
@@ -9,11 +10,6 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use trainer::gpu::Gpu;
 use trainer::{DepthMap, Keyframe, Method, Picture, Split};
-
-/// A pixel that a model covers by less has the depth of nothing.
-const LEAST_ALPHA: u8 = 128;
-/// A model that shows less of what images lack is hardly of what they see.
-const LEAST_DRAWN_FRAC: f64 = 0.05;
 
 /// A saved model that depth is drawn from.
 #[derive(Clone, Debug)]
@@ -37,13 +33,13 @@ pub(crate) struct DrawnDepth {
 impl DepthSource {
     /// The model in a folder, or in a file of splats.
     pub(crate) fn find(model: &Path) -> anyhow::Result<Self> {
-        run_folder::expect_one_model(model)?;
+        let wrong = |error: anyhow::Error| BadArgument(format!("--depth-from: {error:#}"));
+        run_folder::expect_model(model).map_err(wrong)?;
         let sha256 = if model.is_file() {
             let bytes = std::fs::read(model).with_context(|| format!("cannot read {}", model.display()))?;
             run_folder::hex(&Sha256::digest(bytes))
         } else {
-            let wrong = |error: anyhow::Error| BadArgument(format!("--depth-from: {error:#}"));
-            run_folder::checkpoint_sha256(model).map_err(wrong)?
+            run_folder::checkpoint_sha256(model)?
         };
         Ok(Self { model: model.to_owned(), sha256 })
     }
@@ -68,17 +64,15 @@ impl DepthSource {
         }
         bar.finish_and_clear();
         if sum.n_missing > 0 && sum.n_drawn == 0 {
-            return Err(LackOfEvidence(format!(
-                "--depth-from {place}: no image sees anything of that model where it lacks depth; are both of one place, in one world frame?"
-            ))
-            .into());
+            let told = "no image sees anything of that model where it lacks depth";
+            return Err(LackOfEvidence(format!("--depth-from {place}: {told}; {OTHER_PLACE}")).into());
         }
         let drawn_frac = sum.n_drawn as f64 / sum.n_missing.max(1) as f64;
         let images = print::counted(n_images as u64, "image");
         let told = format!("depth of {images} was drawn from {place}: {:.1} % of what they lacked", 100.0 * drawn_frac);
         match (sum.n_missing, drawn_frac) {
             (0, _) => log::warn!("--depth-from {place}: no image to learn from lacks depth, so it changes nothing"),
-            (_, frac) if frac < LEAST_DRAWN_FRAC => log::warn!("{told}; are both of one place, in one world frame?"),
+            (_, frac) if frac < LEAST_SEEN_FRAC => log::warn!("{told}; {OTHER_PLACE}"),
             _ => log::info!("{told}"),
         }
         Ok(DrawnDepth { model: self.model.clone(), model_sha256: self.sha256.clone(), n_images, drawn_frac })
@@ -118,11 +112,11 @@ fn fill(model: &mut dyn Method, keyframe: &mut Arc<Keyframe>) -> anyhow::Result<
         depth_m: vec![0.0; keyframe.size_px[0] as usize * keyframe.size_px[1] as usize].into(),
         world_from_camera: keyframe.world_from_camera,
     });
-    let own = depth.depth_m.clone();
-    let Some(drawn) = evaluate::draw_depth(model, &asked)? else { return Ok(Filled::default()) };
-    let (depth_m, filled) = both(&own, &drawn);
+    let own = depth.clone();
+    let Some(drawn) = evaluate::draw_depth(model, &asked, &own)? else { return Ok(Filled::default()) };
+    let (depth_m, filled) = both(&own.depth_m, &drawn);
     if filled.n_drawn > 0 {
-        asked.depth = asked.depth.map(|depth| DepthMap { depth_m: depth_m.into(), ..depth });
+        asked.depth = Some(DepthMap { depth_m: depth_m.into(), ..own });
         *keyframe = Arc::new(asked);
     }
     Ok(filled)

@@ -2,6 +2,7 @@
 //!
 //! The one evaluation of the program: `train`, `run` and `eval` tell the same numbers for the same model.
 
+use crate::print;
 use anyhow::Context;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -10,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use trainer::eval::{Lpips, PixelPair, SurfaceError, depth_rmse_m, psnr, ssim, surface_error};
 use trainer::splat::PosedLens;
-use trainer::{Keyframe, Method, Picture, Projection, RenderRequest};
+use trainer::{DepthMap, Keyframe, Method, Picture, Projection, RenderRequest};
 
 /// Names the weights of LPIPS where no flag does.
 const LPIPS_WEIGHTS: &str = "FIELDRIG_LPIPS_WEIGHTS";
@@ -18,6 +19,13 @@ const LPIPS_WEIGHTS: &str = "FIELDRIG_LPIPS_WEIGHTS";
 const NEAR_M: f64 = 0.01;
 /// Nothing further than this is drawn, metres.
 const FAR_M: f64 = 1000.0;
+
+/// A pixel that a model covers by less shows nothing of it.
+pub(crate) const LEAST_ALPHA: u8 = 128;
+/// A model that covers less of what is looked at is hardly of that place.
+pub(crate) const LEAST_SEEN_FRAC: f64 = 0.05;
+/// What to ask then.
+pub(crate) const OTHER_PLACE: &str = "are both of one place, in one world frame?";
 
 /// Which scores are wanted.
 #[derive(Clone)]
@@ -51,6 +59,9 @@ pub(crate) struct ImageScores {
     /// dB of the delivered image against the noise-free one; in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) psnr_ceiling: Option<f64>,
+    /// Share of its pixels that the model covers.
+    #[serde(skip)]
+    pub(crate) seen_frac: f64,
 }
 
 /// Means over the test images. `None` is not known, never zero.
@@ -102,6 +113,7 @@ impl Evaluator {
             surface_within_5_mm: depth.surface.map(|surface| surface.near_frac),
             psnr_truth: if self.all { truth_score(method, keyframe)? } else { None },
             psnr_ceiling: keyframe.truth.as_ref().and_then(|truth| truth.psnr_ceiling),
+            seen_frac: seen_frac(&drawn),
         })
     }
 
@@ -163,6 +175,22 @@ impl Display for Scores {
     }
 }
 
+/// Share of a picture's pixels that the model covers.
+pub(crate) fn seen_frac(picture: &Picture) -> f64 {
+    let pixels = picture.rgba_srgb.as_chunks::<4>().0;
+    let n_seen = pixels.iter().filter(|[.., alpha]| *alpha >= LEAST_ALPHA).count();
+    n_seen as f64 / pixels.len().max(1) as f64
+}
+
+/// Says when a model covers next to nothing of pictures, from the share of each that it covers.
+pub(crate) fn warn_of_other_place(seen_fracs: &[f64]) {
+    let seen_frac = seen_fracs.iter().sum::<f64>() / seen_fracs.len().max(1) as f64;
+    if seen_frac < LEAST_SEEN_FRAC {
+        let views = print::counted(seen_fracs.len() as u64, "view");
+        log::warn!("the model covers {:.1} % of {views}; {OTHER_PLACE}", 100.0 * seen_frac);
+    }
+}
+
 /// Mean of what is known.
 fn mean(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
     let (mut sum, mut n) = (0.0, 0.0);
@@ -188,9 +216,13 @@ pub(crate) fn draw(method: &mut dyn Method, keyframe: &Keyframe) -> Result<Pictu
     Ok(picture)
 }
 
-/// The picture a model shows where a keyframe's depth was taken, which has its own size, lens and pose; `None` without depth.
-pub(crate) fn draw_depth(method: &mut dyn Method, keyframe: &Keyframe) -> Result<Option<Picture>, trainer::Error> {
-    let Some(depth) = &keyframe.depth else { return Ok(None) };
+/// The picture a model shows where a keyframe's depth was taken, of the size and lens of `depth`: the keyframe's, or every so manieth
+/// reading of it. `None` for a keyframe without depth.
+pub(crate) fn draw_depth(
+    method: &mut dyn Method,
+    keyframe: &Keyframe,
+    depth: &DepthMap,
+) -> Result<Option<Picture>, trainer::Error> {
     let lens = method.posed_lens(keyframe)?;
     let Some(color_from_depth) = lens.color_from_depth else { return Ok(None) };
     let drawn = method.render(&RenderRequest {
@@ -231,13 +263,14 @@ struct DepthError {
 }
 
 fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<DepthError> {
-    let Some(depth) = &keyframe.depth else { return Ok(DepthError::default()) };
-    let depth = depth.every(method.depth_stride());
-    let asked = Keyframe { depth: Some(depth.clone()), ..keyframe.clone() };
-    let Some(drawn) = draw_depth(method, &asked)? else { return Ok(DepthError::default()) };
+    let Some(whole) = &keyframe.depth else { return Ok(DepthError::default()) };
+    let stride = method.depth_stride();
+    let thin = (stride > 1).then(|| whole.every(stride));
+    let depth = thin.as_ref().unwrap_or(whole);
+    let Some(drawn) = draw_depth(method, keyframe, depth)? else { return Ok(DepthError::default()) };
     Ok(DepthError {
         rmse_m: depth_rmse_m(&drawn.depth_m, &depth.depth_m)?,
-        surface: surface_error(&drawn.depth_m, &depth)?,
+        surface: surface_error(&drawn.depth_m, depth)?,
     })
 }
 
@@ -266,7 +299,14 @@ mod tests {
             surface_within_5_mm: None,
             psnr_truth: None,
             psnr_ceiling: None,
+            seen_frac: 1.0,
         }
+    }
+
+    #[test]
+    fn pixels_are_seen_where_the_model_covers_them_by_half() {
+        let rgba_srgb = [0, LEAST_ALPHA - 1, LEAST_ALPHA, 255].into_iter().flat_map(|alpha| [9, 9, 9, alpha]).collect();
+        assert_eq!(seen_frac(&Picture { size_px: [2, 2], rgba_srgb, depth_m: vec![0.0; 4] }), 0.5);
     }
 
     #[test]

@@ -38,7 +38,10 @@ pub(crate) struct LackOfEvidence(pub(crate) String);
 
 /// The exit code of an error.
 pub(crate) fn of(error: &anyhow::Error) -> Exit {
-    if error.chain().any(|cause| cause.is::<BadArgument>() || cause.is::<ConfigError>()) {
+    let is_small_budget = |cause: &(dyn std::error::Error + 'static)| {
+        matches!(cause.downcast_ref(), Some(trainer::Error::BudgetTooSmall { .. }))
+    };
+    if error.chain().any(|cause| cause.is::<BadArgument>() || cause.is::<ConfigError>() || is_small_budget(cause)) {
         Exit::BadArguments
     } else if error.chain().any(|cause| cause.is::<LackOfEvidence>()) {
         Exit::Refused
@@ -71,6 +74,8 @@ mod tests {
         let error = anyhow::Error::new(BadArgument("unknown key".into())).context("rig file");
         assert_eq!(of(&error), Exit::BadArguments);
         assert_eq!(of(&anyhow::anyhow!("disk full")), Exit::Failed);
+        let budget = trainer::Error::BudgetTooSmall { model: "neural field", max_bytes: 1, least_bytes: 2 };
+        assert_eq!(of(&anyhow::Error::new(budget).context("run")), Exit::BadArguments);
     }
 
     #[test]

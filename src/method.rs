@@ -2,7 +2,7 @@
 
 use crate::config::Train;
 use crate::exit::BadArgument;
-use crate::run_folder::expect_one_model;
+use crate::run_folder::{expect_model, expect_one_model};
 use crate::splat_file;
 use anyhow::Context;
 use std::path::Path;
@@ -144,6 +144,7 @@ pub(crate) fn kind_in(folder: &Path) -> anyhow::Result<Option<Kind>> {
 
 /// A saved model: its folder, of any kind, or a file of splats.
 pub(crate) fn load(gpu: Arc<Gpu>, model: &Path) -> anyhow::Result<Box<dyn Method>> {
+    expect_model(model)?;
     match kind_in(model)? {
         Some(Kind::Tsdf) => return Ok(Box::new(Aligned::of_folder(TsdfModel::load(gpu, model)?, model)?)),
         Some(Kind::Nerf) => return Ok(Box::new(Aligned::of_folder(NerfModel::load(gpu, model)?, model)?)),

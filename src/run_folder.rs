@@ -1,9 +1,10 @@
 //! Where the results of a run go, and what its report says.
 
 use crate::config::Rig;
-use crate::exit::BadArgument;
+use crate::exit::{self, BadArgument, Exit};
 use crate::method::Kind;
-use anyhow::{Context, ensure};
+use crate::splat_file;
+use anyhow::{Context, bail, ensure};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
@@ -12,7 +13,11 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use trainer::{Keyframe, Method};
 
 /// The files of a saved model: what `checkpoint_sha256` covers, in this order.
-const MODEL_FILES: [&str; 6] = ["model.json", "mesh.ply", "mesh.glb", "field.blocks", "field.nerf", "splats.ply"];
+const MODEL_FILES: [&str; 6] = ["model.json", "mesh.ply", "mesh.glb", "field.blocks", "field.nerf", SPLATS];
+/// The one of them that is a model by itself.
+const SPLATS: &str = "splats.ply";
+/// Where the folders of runs lie unasked.
+const RUNS: &str = "runs";
 /// Where a model lies until it is whole.
 const UNFINISHED: &str = "model.part";
 /// What training needs to go on, in the folder of a run.
@@ -50,28 +55,110 @@ pub(crate) fn expect_one_model(folder: &Path) -> Result<(), BadArgument> {
     Err(BadArgument(format!("{}: a folder for each method lies in it, name {}", folder.display(), inside.join(" or "))))
 }
 
-/// Makes the folder of each model of a run: the one asked for where there is one model, else one inside it by the name of its
-/// method. The settled rig file, where there is one, is written into each: beside a model the one that makes it alone.
-pub(crate) fn make_each(asked: Option<&Path>, kinds: &[Kind], rig: Option<&Rig>) -> anyhow::Result<Vec<PathBuf>> {
-    let write = |rig: &Rig, folder: &Path| {
-        rig.write_settled(folder).with_context(|| format!("cannot write into {}", folder.display()))
-    };
-    let out = make(asked)?;
-    let folders: Vec<PathBuf> = match kinds {
-        [_] => vec![out.clone()],
-        several => several.iter().map(|kind| make(Some(&out.join(kind.name())))).collect::<anyhow::Result<_>>()?,
-    };
-    if let Some(rig) = rig {
-        write(rig, &out)?;
-        for (kind, folder) in kinds.iter().zip(&folders) {
-            write(&rig.with_method(*kind), folder)?;
+/// Refuses what holds no model: what is not there, a folder without one or with several, and a file that is but a part of one.
+pub(crate) fn expect_model(model: &Path) -> anyhow::Result<()> {
+    let shown = model.display();
+    ensure!(model.exists(), "{shown} does not exist");
+    if model.is_dir() {
+        expect_one_model(model)?;
+        if MODEL_FILES.iter().any(|name| model.join(name).exists()) {
+            return Ok(());
         }
+        let has_checkpoint = model.join(CHECKPOINT).exists();
+        let instead = if has_checkpoint { " but a checkpoint: train --resume goes on from it to one" } else { "" };
+        bail!("{shown} holds no model{instead}");
     }
-    Ok(folders)
+    let is_part = model.file_name().is_some_and(|name| name != SPLATS && MODEL_FILES.iter().any(|file| name == *file));
+    if is_part || splat_file::Format::of(model).is_none() {
+        let told = format!("{shown} is no file of splats (.ply, .spz); of a saved model name its folder");
+        return Err(BadArgument(told).into());
+    }
+    Ok(())
 }
 
-/// Makes the folder asked for, or `runs/<UTC time>`; one that holds a model is refused.
-pub(crate) fn make(asked: Option<&Path>) -> anyhow::Result<PathBuf> {
+/// Folders that this run made; a refused run takes them back.
+#[derive(Debug, Default)]
+pub(crate) struct MadeFolders {
+    /// Each before the one it lies in.
+    leaves: Vec<PathBuf>,
+    /// What leads to them, each before the one it lies in.
+    above: Vec<PathBuf>,
+}
+
+impl MadeFolders {
+    /// Makes the folder of each model of a run: the one asked for where there is one model, else one inside it by the name of its
+    /// method. The settled rig file, where there is one, is written into each: beside a model the one that makes it alone.
+    pub(crate) fn make_each(
+        &mut self,
+        asked: Option<&Path>,
+        kinds: &[Kind],
+        rig: Option<&Rig>,
+    ) -> anyhow::Result<Vec<PathBuf>> {
+        let write = |rig: &Rig, folder: &Path| {
+            rig.write_settled(folder).with_context(|| format!("cannot write into {}", folder.display()))
+        };
+        let out = self.make(asked)?;
+        let folders: Vec<PathBuf> = match kinds {
+            [_] => vec![out.clone()],
+            several => {
+                several.iter().map(|kind| self.make(Some(&out.join(kind.name())))).collect::<anyhow::Result<_>>()?
+            }
+        };
+        if let Some(rig) = rig {
+            write(rig, &out)?;
+            for (kind, folder) in kinds.iter().zip(&folders) {
+                write(&rig.with_method(*kind), folder)?;
+            }
+        }
+        Ok(folders)
+    }
+
+    /// Makes the folder asked for, or `runs/<UTC time>`; one that holds a model is refused.
+    pub(crate) fn make(&mut self, asked: Option<&Path>) -> anyhow::Result<PathBuf> {
+        let is_absent = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
+        let absent = |folder: &Path| folder.ancestors().take_while(is_absent).map(Path::to_owned).collect::<Vec<_>>();
+        let runs = absent(Path::new(RUNS));
+        let asked_for = asked.map_or(Vec::new(), absent);
+        let made = make(asked)?;
+        match (asked, asked_for.split_first()) {
+            (None, _) => {
+                self.leaves.insert(0, made.clone());
+                self.above.splice(0..0, runs);
+            }
+            (Some(_), Some((leaf, above))) => {
+                self.leaves.insert(0, leaf.clone());
+                self.above.splice(0..0, above.iter().cloned());
+            }
+            (Some(_), None) => {} // Somebody else's.
+        }
+        Ok(made)
+    }
+
+    /// Removes what was made and all in it, but not where a model or a checkpoint is: somebody will want that.
+    pub(crate) fn take_back(self) {
+        let is_wanted =
+            |folder: &PathBuf| MODEL_FILES.iter().chain([&CHECKPOINT]).any(|name| folder.join(name).exists());
+        if self.leaves.iter().any(is_wanted) {
+            return;
+        }
+        let removed = self.leaves.iter().try_for_each(std::fs::remove_dir_all);
+        // What others put something into meanwhile is not empty, and stays.
+        let removed = removed.and_then(|()| self.above.iter().try_for_each(std::fs::remove_dir));
+        if let Err(error) = removed {
+            log::debug!("what a refused run leaves behind: {error}");
+        }
+    }
+
+    /// Takes back what was made where a command was refused: bad arguments, or nothing to work on.
+    pub(crate) fn after<T>(self, ended: anyhow::Result<T>) -> anyhow::Result<T> {
+        if ended.as_ref().is_err_and(|error| matches!(exit::of(error), Exit::BadArguments | Exit::Refused)) {
+            self.take_back();
+        }
+        ended
+    }
+}
+
+fn make(asked: Option<&Path>) -> anyhow::Result<PathBuf> {
     if let Some(folder) = asked {
         if folder.to_str().is_none() {
             return Err(
@@ -85,12 +172,12 @@ pub(crate) fn make(asked: Option<&Path>) -> anyhow::Result<PathBuf> {
     }
     #[expect(clippy::disallowed_methods, reason = "a name for people; nothing is measured by it")]
     let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    std::fs::create_dir_all("runs").context("cannot make the folder runs")?;
+    std::fs::create_dir_all(RUNS).context("cannot make the folder runs")?;
     let name = name_from_time(since_epoch);
     for attempt in 1..100 {
         let folder = match attempt {
-            1 => PathBuf::from(format!("runs/{name}")),
-            _ => PathBuf::from(format!("runs/{name}-{attempt}")),
+            1 => Path::new(RUNS).join(&name),
+            _ => Path::new(RUNS).join(format!("{name}-{attempt}")),
         };
         match std::fs::create_dir(&folder) {
             Ok(()) => {
@@ -101,7 +188,7 @@ pub(crate) fn make(asked: Option<&Path>) -> anyhow::Result<PathBuf> {
             Err(error) => return Err(error).with_context(|| format!("cannot make the folder {}", folder.display())),
         }
     }
-    anyhow::bail!("runs/{name} and ninety-eight more exist already: name a folder with --out")
+    bail!("runs/{name} and ninety-eight more exist already: name a folder with --out")
 }
 
 /// Keeps other runs out of a folder as long as this process lives.
@@ -222,7 +309,8 @@ mod tests {
     fn several_models_lie_in_folders_of_their_own_and_are_found() {
         let folder = tempfile::tempdir().expect("folder");
         let asked = folder.path().join("out");
-        let made = make_each(Some(&asked), &[Kind::Tsdf, Kind::Splat], None).expect("it is free");
+        let kinds = [Kind::Tsdf, Kind::Splat];
+        let made = MadeFolders::default().make_each(Some(&asked), &kinds, None).expect("it is free");
         assert_eq!(made, [asked.join("tsdf"), asked.join("splat")]);
         expect_one_model(&asked).expect("there is none yet");
         std::fs::write(made[0].join(CHECKPOINT), b"{}").expect("file");
@@ -232,6 +320,47 @@ mod tests {
         expect_one_model(&made[1]).expect("one");
         let told = refuse_model(&asked).expect_err("one inside").0;
         assert!(told.contains("splat/splats.ply"), "{told}");
+    }
+
+    #[test]
+    fn a_refused_run_takes_back_what_it_made_and_nothing_else() {
+        let folder = tempfile::tempdir().expect("folder");
+        let (ours, theirs) = (folder.path().join("a/b"), folder.path().join("theirs"));
+        std::fs::create_dir(&theirs).expect("room on the disk");
+        let refused = || Err::<(), _>(anyhow::Error::new(BadArgument("too small".into())));
+        for (asked, is_left) in [(&ours, false), (&theirs, true)] {
+            let mut made = MadeFolders::default();
+            made.make_each(Some(asked), &[Kind::Tsdf, Kind::Splat], None).expect("it is free");
+            assert!(made.after(refused()).is_err());
+            assert_eq!((asked.exists(), asked.join("tsdf").exists()), (is_left, false), "{asked:?}");
+        }
+        assert!(!folder.path().join("a").exists());
+        for (ended, file) in [(refused(), CHECKPOINT), (Err(anyhow::anyhow!("the disk is full")), "keyframes.txt")] {
+            let mut made = MadeFolders::default();
+            let out = folder.path().join(file);
+            made.make(Some(&out)).expect("it is free");
+            std::fs::write(out.join(file), b"x").expect("file");
+            assert!(made.after(ended).is_err() && out.exists(), "{file}");
+        }
+    }
+
+    #[test]
+    fn what_holds_no_model_says_what_to_name() {
+        let folder = tempfile::tempdir().expect("folder");
+        let at = |name: &str| folder.path().join(name);
+        let told = |name: &str| expect_model(&at(name)).expect_err("no model").to_string();
+        assert!(told("absent").ends_with("absent does not exist"));
+        assert!(told("").ends_with("holds no model"));
+        for name in [CHECKPOINT, "report.json", "scan.mcap", "mesh.ply"] {
+            std::fs::write(at(name), b"x").expect("file");
+            assert!(told(name).contains("name its folder"), "{name}");
+            if name == CHECKPOINT {
+                assert!(told("").contains("--resume"));
+            }
+        }
+        std::fs::write(at(SPLATS), b"x").expect("file");
+        expect_model(&at(SPLATS)).expect("a file of splats");
+        expect_model(folder.path()).expect("a folder with splats");
     }
 
     #[test]

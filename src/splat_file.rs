@@ -34,14 +34,16 @@ pub(crate) fn is_one(path: &Path) -> bool {
     path.join(IN_FOLDER).is_file() || (path.is_file() && Format::of(path).is_some())
 }
 
-/// Reads the splats of a model's folder or of a file; a file without a known ending is taken for a `.ply`.
+/// Reads the splats of a model's folder or of a file.
 pub(crate) fn read(model: &Path) -> anyhow::Result<SplatArrays> {
-    let path: PathBuf = if model.is_file() { model.to_owned() } else { model.join(IN_FOLDER) };
+    let is_file = model.is_file();
+    let path: PathBuf = if is_file { model.to_owned() } else { model.join(IN_FOLDER) };
     let splats = match Format::of(&path) {
         Some(Format::Spz) => spz::read(&path),
         Some(Format::Ply) | None => ply::read(&path),
     };
-    splats.with_context(|| format!("no model in {}", model.display()))
+    let instead = if is_file { "; of a saved model name its folder" } else { "" };
+    splats.with_context(|| format!("no splats in {}{instead}", model.display()))
 }
 
 /// Writes splats to a file.

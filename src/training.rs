@@ -1,13 +1,14 @@
 //! One training from keyframes on disk to a model: what `train` does once, and `bench` many times over.
 
 use crate::config::{Rig, USUAL_SEED};
-use crate::data::Data;
+use crate::data::{self, Data, DataArgs};
 use crate::exit::{BadArgument, LackOfEvidence};
 use crate::method::{self, Kind, Recipe};
 use crate::session::{Evaluators, Limits, Session, Tell};
 use crate::stop::Stop;
 use crate::training_args::{Evidence, HowMany, Refine, Refining, TrainingArgs};
 use crate::turns;
+use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::Keyframe;
@@ -110,6 +111,13 @@ pub(crate) fn recipes(
         }
     };
     Ok(kinds.iter().map(|kind| Recipe { kind: *kind, options: options.clone() }).collect())
+}
+
+/// Refuses flags that make no sense whatever the data hold, before all of those are read.
+pub(crate) fn check_before_data(args: &TrainingArgs, path: &Path, images: &DataArgs) -> anyhow::Result<()> {
+    let usual = || Data::usual_kinds(path, images);
+    let kinds = args.methods().map_or_else(usual, |kinds| Ok(kinds.to_vec()))?;
+    Ok(args.check_before_data(&kinds, data::is_recording(path))?)
 }
 
 /// When to stop, from `--seconds` and `--steps`; after `usual_secs` when neither is given.

@@ -3,21 +3,25 @@
 use crate::config::{self, MAX_BYTES, MAX_SPLATS, Override, SEED};
 use crate::exit::BadArgument;
 use crate::method::{self, Kind};
-use clap::value_parser;
+use clap::{ValueEnum, value_parser};
 use trainer::align;
 use trainer::splat::{CameraChoice, CountChoice, TermSet};
+
+/// The key of a rig file that `--refine` stands for.
+pub(crate) const REALIGN: &str = "base.realign";
 
 /// What to train, and how large it may become.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct TrainingArgs {
-    /// Scene model: splat; nerf, a neural field; or tsdf, a distance field with a mesh; several, separated by commas, learn
-    /// at once [default: the rig file's, else splat]
+    /// Scene model: splat; nerf, a neural field; or tsdf, a distance field with a mesh; or several, separated by commas: `train`
+    /// and `run` let them learn at once, `bench curve` one after the other [default: the rig file's, else splat]
     #[arg(long, value_name = "METHOD", value_parser = methods)]
     pub(crate) method: Option<Methods>,
-    /// Seed of everything random, 0 to 2^63 - 1; with --steps, one seed gives one result [default: the rig file's, else 1]
+    /// Seed of everything random, 0 to 2^63 - 1; trained for the same number of steps, one seed gives one result
+    /// [default: the rig file's, else 1]
     #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(SEED))]
     pub(crate) seed: Option<u64>,
-    /// Most GPU bytes the model may take, at least 1000000 [default: the rig file's, else no bound but memory]
+    /// Most GPU bytes the model may take, at least 1000000, and what the smallest model of the method takes [default: the rig file's, else no bound but memory]
     #[arg(long, value_name = "BYTES", value_parser = value_parser!(u64).range(MAX_BYTES))]
     pub(crate) max_bytes: Option<u64>,
     /// Most splats, 1 to 100000000 [default: the rig file's, else 400000]
@@ -77,6 +81,13 @@ pub(crate) enum Refine {
     ImageGains,
 }
 
+impl Refine {
+    /// As it is written.
+    fn name(&self) -> String {
+        self.to_possible_value().map_or(String::new(), |name| name.get_name().to_owned())
+    }
+}
+
 /// What is found about cameras, and how.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Refining {
@@ -115,20 +126,33 @@ impl TrainingArgs {
         }
     }
 
-    /// Refuses terms that were asked for and that no scene model learns: those that come along with the scene.
+    /// Refuses flags that make no sense whatever the data hold, before those are read.
+    pub(crate) fn check_before_data(&self, kinds: &[Kind], joints: bool) -> Result<(), BadArgument> {
+        let most = Evidence { joints, drifts: true, depth: true };
+        self.check_for(kinds)?;
+        self.refining(most, Refine::None)?;
+        self.check_learned(kinds, most)
+    }
+
+    /// Refuses terms that were asked for and that no scene model finds, and names those that one does.
     pub(crate) fn check_learned(&self, kinds: &[Kind], evidence: Evidence) -> Result<(), BadArgument> {
         let can_align = |term: &Refine| evidence.depth && *term != Refine::ImageGains;
         let can_learn =
             |term: &Refine| kinds.contains(&Kind::Nerf) && matches!(term, Refine::ImagePoses | Refine::ImageGains);
         let is_other = |term: &Refine| matches!(term, Refine::Auto | Refine::None | Refine::Base);
-        let is_left = |term: &Refine| is_other(term) || can_align(term) || can_learn(term);
-        if kinds.contains(&Kind::Splat) || self.refine.iter().all(is_left) {
+        let is_known = |term: &Refine| is_other(term) || can_align(term) || can_learn(term);
+        if kinds.contains(&Kind::Splat) {
             return Ok(());
         }
-        let along = if kinds.contains(&Kind::Nerf) { ", learns image-poses and image-gains along" } else { "" };
+        let Some(unknown) = self.refine.iter().find(|term| !is_known(term)) else { return Ok(()) };
+        let known: Vec<String> =
+            Refine::value_variants().iter().filter(|term| is_known(term)).map(Refine::name).collect();
+        let without = if evidence.depth { "" } else { " of images without depth, or whose depth comes later" };
         Err(BadArgument(format!(
-            "--refine: the method {} corrects cameras by laying images with depth over each other at the start{along}, and no others",
-            method::in_words(kinds)
+            "--refine {}: the method {} does not find that{without}, only {}",
+            unknown.name(),
+            method::in_words(kinds),
+            known.join(", ")
         )))
     }
 
@@ -144,9 +168,8 @@ impl TrainingArgs {
         }
         let needs_depth = [Refine::Joints, Refine::DepthPose, Refine::DepthScale, Refine::Readout];
         if let (Some(term), false) = (needs_depth.into_iter().find(|term| has(*term)), evidence.depth) {
-            let name =
-                clap::ValueEnum::to_possible_value(&term).map_or(String::new(), |name| name.get_name().to_owned());
-            return Err(BadArgument(format!("--refine {name}: needs images with depth, and all of them at the start")));
+            let told = "needs images with depth, and all of them at the start";
+            return Err(BadArgument(format!("--refine {}: {told}", term.name())));
         }
         if has(Refine::Joints) && !evidence.joints {
             return Err(BadArgument("--refine joints: needs a recording of an arm".into()));
@@ -195,11 +218,14 @@ impl TrainingArgs {
         if let Some(n) = self.max_splats {
             overrides.push(Override::new("train.max_splats", n.cast_signed()));
         }
-        if !self.refine.is_empty() {
-            let realign = self.refine.iter().any(|term| matches!(term, Refine::Auto | Refine::Base));
-            overrides.push(Override::new("base.realign", realign));
-        }
+        overrides.extend(self.realign().map(|is_on| Override::new(REALIGN, is_on)));
         overrides
+    }
+
+    /// Whether a base that walks is found anew at each stand, where `--refine` is given.
+    pub(crate) fn realign(&self) -> Option<bool> {
+        let is_on = || self.refine.iter().any(|term| matches!(term, Refine::Auto | Refine::Base));
+        (!self.refine.is_empty()).then(is_on)
     }
 }
 
@@ -267,8 +293,20 @@ mod tests {
         assert!(args.check_for(&both).is_ok() && args.check_learned(&both, evidence).is_ok());
         let told = args.check_for(&[Kind::Tsdf, Kind::Nerf]).unwrap_err().0;
         assert!(told.contains("--max-splats") && told.contains("tsdf and nerf"), "{told}");
-        assert!(args.check_learned(&[Kind::Tsdf], evidence).is_err());
+        let told = args.check_learned(&[Kind::Tsdf], evidence).unwrap_err().0;
+        assert!(
+            told.starts_with("--refine image-gains: the method tsdf does not find that, only auto, none, base, mount,"),
+            "{told}"
+        );
+        assert!(told.ends_with("readout, image-poses"), "{told}");
         assert!(args.check_learned(&[Kind::Nerf], evidence).is_ok());
+        let args = TrainingArgs { refine: vec![Refine::Mount], ..no_flags() };
+        assert!(args.check_before_data(&[Kind::Nerf], false).is_ok());
+        let told = args.check_learned(&[Kind::Nerf], Evidence { depth: false, ..evidence }).unwrap_err().0;
+        assert!(told.ends_with("only auto, none, base, image-poses, image-gains"), "{told}");
+        let args = TrainingArgs { refine: vec![Refine::Joints], ..no_flags() };
+        assert!(args.check_before_data(&[Kind::Splat], true).is_ok());
+        assert!(args.check_before_data(&[Kind::Splat], false).is_err());
     }
 
     #[test]

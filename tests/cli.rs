@@ -106,14 +106,28 @@ fn only_loopback_is_served() {
 fn data_that_is_not_there_or_is_none_is_told() {
     let folder = tempfile::tempdir().expect("a folder");
     let empty = folder.path().to_str().expect("a plain name");
-    assert_refused(&["train", "absent"], 1, &["absent"]);
+    assert_refused(&["train", "absent"], 1, &["absent does not exist"]);
     assert_refused(&["train", empty], 1, &[empty]);
-    assert_refused(&["train", "absent.mcap"], 1, &["absent.mcap"]);
+    assert_refused(&["train", "absent.mcap"], 1, &["absent.mcap does not exist"]);
     let recording = folder.path().join("torn.mcap");
     std::fs::write(&recording, b"\x89MCAP0\r\n").expect("room on the disk");
     assert_refused(&["train", recording.to_str().expect("a plain name")], 1, &["torn.mcap"]);
-    assert_refused(&["eval", empty, "absent"], 1, &["absent"]);
-    assert_refused(&["render", empty, "--pose", "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"], 1, &[empty]);
+    assert_refused(&["eval", empty, "absent"], 1, &["absent does not exist"]);
+    let no_model = format!("{empty} holds no model");
+    assert_refused(&["eval", empty, empty], 1, &[&no_model]);
+    let pose = ["--pose", "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"];
+    assert_refused(&["render", empty, pose[0], pose[1]], 1, &[&no_model]);
+    assert_refused(&["render", "absent", pose[0], pose[1]], 1, &["absent does not exist"]);
+    for part in ["torn.mcap", "mesh.ply", "report.json"] {
+        let file = folder.path().join(part);
+        std::fs::write(&file, "a part").expect("room on the disk");
+        let file = file.to_str().expect("a plain name");
+        assert_refused(&["render", file, pose[0], pose[1]], 2, &[part, "name its folder"]);
+        assert_refused(&["eval", file, empty], 2, &[part, "name its folder"]);
+    }
+    let mesh = folder.path().join("mesh.ply");
+    let export = ["export", mesh.to_str().expect("a plain name"), "--to", "glb", "--out", "a.glb"];
+    assert_refused(&export, 2, &["name its folder"]);
 }
 
 #[test]
@@ -126,6 +140,14 @@ fn arguments_that_make_no_sense_exit_with_2() {
         assert_refused(&["train", "absent", flag, value], 2, &[flag]);
         assert_refused(&["run", "absent.toml", flag, value], 2, &[flag]);
     }
+    // Before data are read: there are none here.
+    let refine = |words| ["train", "absent", "--method", "tsdf", "--refine", words];
+    assert_refused(
+        &refine("mount,image-gains"),
+        2,
+        &["image-gains", "tsdf does not", "mount, delay, joints, depth-pose"],
+    );
+    assert_refused(&refine("mount,auto"), 2, &["stand alone"]);
     for (flag, value) in [("--splats", "0"), ("--splats", "100000000000"), ("--repeats", "0"), ("--size", "0x9")] {
         assert_refused(&["bench", "kernels", flag, value], 2, &[flag]);
     }
@@ -143,12 +165,17 @@ fn arguments_that_make_no_sense_exit_with_2() {
     let record = ["record", &rig, "--sim", "--lockstep", "--out", out.to_str().expect("a plain name")];
     assert_refused(&record, 2, &["lockstep", "--seconds"]);
     assert!(!out.exists(), "what is refused leaves nothing behind");
+    let out = folder.path().join("refused");
+    let to = ["--listen", "127.0.0.1:0", "--out", out.to_str().expect("a plain name")];
     for (flag, value) in [("--max-splats", "9"), ("--refine", "mount"), ("--count", "to-cap")] {
         for method in ["nerf", "tsdf"] {
             let run = ["run", &rig, "--sim", "--method", method, flag, value];
-            assert_refused(&run, 2, &[flag, "method", method]);
+            assert_refused(&[&run[..], &to].concat(), 2, &[flag, "method", method]);
         }
     }
+    let run = ["run", &rig, "--sim", "--method", "tsdf", "--max-bytes", "1000000"];
+    assert_refused(&[&run[..], &to].concat(), 2, &["1000000", "the smallest distance field takes 2629632 bytes"]);
+    assert!(!out.exists(), "what is refused leaves nothing behind");
     for address in ["7105", "localhost:7105"] {
         assert_refused(&["run", "rig.toml", "--sim", "--listen", address], 2, &["127.0.0.1:7007"]);
     }

@@ -113,11 +113,20 @@ fn images_without_depth_are_learned_with_that_of_a_model_again_and_again_alike()
     refused(folder, &bare, 2, "leave out --depth-from");
     refused(folder, &["elsewhere", "--depth-from", "field"], 4, "no image sees anything of that model");
     refused(folder, &["seen", "--depth-from", "measured"], 2, "measured holds no model");
-    refused(folder, &["seen", "--depth-from", "field/mesh.ply"], 1, "--depth-from field/mesh.ply: no model in");
+    refused(
+        folder,
+        &["seen", "--depth-from", "field/mesh.ply"],
+        2,
+        "--depth-from: field/mesh.ply is no file of splats",
+    );
+    refused(folder, &["seen", "--method", "tsdf"], 4, "no image to learn from has depth");
 
     // Depth from splats makes a mesh of images that have none.
     done(folder, &["seen", "--method", "tsdf", "--depth-from", "drawn", "--out", "mesh"]);
     let judged = fieldrig(folder, &["eval", "mesh", "measured", "--json"]).stdout;
     let judged: Value = serde_json::from_slice(&judged).expect("a JSON object");
+    let elsewhere = fieldrig(folder, &["eval", "mesh", "elsewhere"]).stderr;
+    let elsewhere = String::from_utf8(elsewhere).expect("stderr is UTF-8");
+    assert!(elsewhere.contains("the model covers 0.0 % of 2 views; are both of one place"), "{elsewhere}");
     assert!(judged["depth_rmse_m"].as_f64().is_some_and(|error_m| error_m < MOST_DEPTH_ERROR_M), "{judged}");
 }

@@ -123,8 +123,8 @@ fn what_the_clock_ended_is_repeated_by_its_log() {
     assert_eq!((&again["checkpoint_sha256"], &again["steps"]), (&timed["checkpoint_sha256"], &timed["steps"]));
 
     // What went on from a checkpoint is repeated from it, and from nothing else.
-    let both =
-        done(folder, &["--resume", "timed", "--seconds", "2", "--scale", "0.5", "--holdout", "5", "--out", "both"]);
+    // Scale and held out images are as they were, unasked.
+    let both = done(folder, &["--resume", "timed", "--seconds", "2", "--out", "both"]);
     assert_ne!(both["checkpoint_sha256"], timed["checkpoint_sha256"]);
     let log = format!("both/decisions-from-{}.jsonl", timed["steps"]);
     let replay = ["--replay-decisions", &log, "--out", "both again"];
@@ -132,6 +132,15 @@ fn what_the_clock_ended_is_repeated_by_its_log() {
     assert_eq!(both_again["checkpoint_sha256"], both["checkpoint_sha256"]);
     let told = |args: &[&str]| refused(&train(folder, &[args, &["--out", "x"]].concat()).output().unwrap(), 2);
     assert!(told(&["--replay-decisions", &log]).contains("with --resume"));
+    assert!(
+        told(&["--resume", "timed", "--scale", "1"])
+            .contains("--scale 1: the checkpoint in timed is of images with --scale 0.5")
+    );
+    assert!(told(&["--resume", "timed", "--holdout", "8"]).contains("with --holdout 5"));
+    assert!(
+        told(&["--resume", "timed", "--seconds", "0.5"])
+            .contains("--seconds 0.5: the checkpoint in timed has been trained for 1.")
+    );
     assert!(told(&["--replay-decisions", &log, "--resume", "both"]).contains("the checkpoint is of step"));
     assert!(told(&["--replay-decisions", "timed/decisions.jsonl", "--resume", "timed"]).contains("leave out --resume"));
     for flag in ["--seed", "--seconds", "--steps", "--holdout", "--scale", "--max-splats"] {

@@ -91,6 +91,9 @@ fn each_of_several_methods_ends_with_the_bits_that_it_has_alone() {
 
     goes_on_method_by_method(folder, together[1]);
     exports_meshes(folder);
+    let small = ["train", "data", "--method", "tsdf,splat", "--max-bytes", "1000000", "--out", "small"];
+    refused(folder, &small, &["the smallest distance field takes 2629632 bytes"]);
+    assert!(!folder.join("small").exists(), "what is refused leaves nothing behind");
     refused(folder, &["eval", "all", "data"], &["all/splat or all/tsdf or all/nerf"]);
     refused(folder, &["train", "data", "--out", "all"], &["holds a model already", "splat/model.json"]);
 }

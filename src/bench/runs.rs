@@ -4,6 +4,7 @@ use crate::data::{Data, DataArgs, Purpose};
 use crate::evaluate::Evaluator;
 use crate::exit::{BadArgument, LackOfEvidence};
 use crate::method::{self, Kind, Recipe};
+use crate::run_folder::MadeFolders;
 use crate::session::{Eval, Evaluators, Limits, Outcome, Tell};
 use crate::stop::Stop;
 use crate::training::{self, Plan};
@@ -136,6 +137,7 @@ pub(crate) struct Job<'a> {
 pub(crate) struct Runs<'a> {
     args: &'a BenchArgs,
     out: PathBuf,
+    made: MadeFolders,
     gpu: Arc<Gpu>,
     stop: Stop,
     n_all: usize,
@@ -170,15 +172,25 @@ impl NamedData {
     }
 }
 
+/// A bench that ends before its first run leaves nothing behind.
+impl Drop for Runs<'_> {
+    fn drop(&mut self) {
+        if std::fs::read_dir(self.out.join(RUNS)).is_ok_and(|mut runs| runs.next().is_none()) {
+            std::mem::take(&mut self.made).take_back();
+        }
+    }
+}
+
 impl<'a> Runs<'a> {
     /// Makes the folder.
     pub(crate) fn open(args: &'a BenchArgs, gpu: Arc<Gpu>) -> anyhow::Result<Self> {
         let stop = Stop::on_ctrl_c()?;
-        let out = run_folder::make(args.out.as_deref())?;
+        let mut made = MadeFolders::default();
+        let out = made.make(args.out.as_deref())?;
         let runs = out.join(RUNS);
         std::fs::create_dir_all(&runs).with_context(|| format!("cannot make the folder {}", runs.display()))?;
         log::info!("{}", gpu.describe());
-        Ok(Self { args, out, gpu, stop, n_all: 0, n_done: 0 })
+        Ok(Self { args, out, made, gpu, stop, n_all: 0, n_done: 0 })
     }
 
     /// The folder of the bench.
@@ -198,6 +210,7 @@ impl<'a> Runs<'a> {
 
     /// Loads data, and finds a name for it that none of `taken` has.
     pub(crate) fn load(&self, path: &Path, taken: &mut HashSet<String>) -> anyhow::Result<NamedData> {
+        training::check_before_data(&self.args.training, path, &self.args.images)?;
         let overrides = self.args.training.overrides();
         let data = Data::load(path, &self.args.images, Purpose::Training, &overrides, self.args.json)?;
         if data.of_split(Split::Test).is_empty() {

@@ -1,8 +1,8 @@
 //! `fieldrig eval`: how good a saved model is on the test images of some data.
 
 use crate::config::{Override, Rig};
-use crate::data::{Data, DataArgs, Purpose};
-use crate::evaluate::{Evaluator, ImageScores, Scores};
+use crate::data::{self, Data, DataArgs, Purpose};
+use crate::evaluate::{Evaluator, ImageScores, Scores, warn_of_other_place};
 use crate::exit::{self, Exit};
 use crate::join::KeyframeList;
 use crate::{method, print};
@@ -46,6 +46,8 @@ struct Named {
 /// Draws and scores every test image.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
+    data::expect(&args.data)?;
+    let mut model = method::load(super::open_gpu()?, &args.model)?; // Before the data, which take long to read.
     let overrides = as_trained(&args.model);
     let data = Data::load(&args.data, &args.images, Purpose::Scoring, &overrides, args.json)?;
     let tests = data.of_split(Split::Test);
@@ -58,8 +60,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             "the model was trained with another rig file: what it knows about cameras corrects that one; see --rig"
         );
     }
-    let mut model = method::load(super::open_gpu()?, &args.model)?;
     let images = evaluator.score_all(model.as_mut(), tests.iter())?;
+    warn_of_other_place(&images.iter().map(|image| image.seen_frac).collect::<Vec<_>>());
     let scores = Scores::mean(&images);
     let is_test = |keyframe: &Keyframe| keyframe.split == Split::Test;
     let names = data.keyframes.iter().zip(data.names).filter(|(keyframe, _)| is_test(keyframe)).map(|(_, name)| name);

@@ -7,6 +7,7 @@ use crate::join::{Join, KeyframeList, Use};
 use crate::method::{self, Kind};
 use crate::open;
 use crate::print::{self, counted};
+use crate::run_folder;
 use crate::splat_file;
 use crate::stands::Stands;
 use anyhow::{Context, ensure};
@@ -107,6 +108,7 @@ fn contents(path: &Path) -> anyhow::Result<Contents> {
         Some(Kind::Splat) | None => {}
     }
     if splat_file::is_one(path) {
+        run_folder::expect_model(path)?;
         return Ok(Contents::Splats);
     }
     let sentence = "neither a folder with a model, nor a file of splats, nor a recording";

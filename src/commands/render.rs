@@ -1,7 +1,9 @@
 //! `fieldrig render`: pictures from a saved model.
 
 use crate::camera_path::{CameraPath, Stand};
+use crate::evaluate::{seen_frac, warn_of_other_place};
 use crate::exit::{BadArgument, Exit};
+use crate::run_folder::expect_model;
 use crate::{method, print};
 use anyhow::Context;
 use serde::Serialize;
@@ -41,7 +43,7 @@ pub(crate) struct Args {
     /// Write depth too, metres along the camera's z axis (distance with --equirect), as .npy
     #[arg(long)]
     depth: bool,
-    /// Folder for the pictures
+    /// Folder for the pictures; one that holds such pictures is refused
     #[arg(long, value_name = "FOLDER", default_value = "renders")]
     out: PathBuf,
     /// Print one JSON object a picture
@@ -100,13 +102,17 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     };
     let size_px = args.size.or(path.size_px).unwrap_or(USUAL_SIZE_PX);
     let requests = path.stands.iter().map(|stand| args.request(stand, size_px)).collect::<Result<Vec<_>, _>>()?;
+    expect_model(&args.model)?;
+    refuse_pictures(&args.out, requests.len())?;
     let mut model = method::load(super::open_gpu()?, &args.model)?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make the folder {}", args.out.display()))?;
     let bar = print::bar(Some(requests.len() as u64), "{bar:30} {pos} of {len}", args.json);
+    let mut seen_fracs = Vec::new();
     for (ix, request) in requests.iter().enumerate() {
         let since = Instant::now();
         let picture = model.render(request)?;
         let draw_ms = since.elapsed().as_secs_f64() * 1e3;
+        seen_fracs.push(seen_frac(&picture));
         let (picture, depth) = write(&args.out, ix, &picture, args.depth)?;
         let drawn = Drawn { picture, depth, size_px, draw_ms };
         bar.inc(1);
@@ -115,6 +121,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         }
     }
     bar.finish_and_clear();
+    warn_of_other_place(&seen_fracs);
     if !args.json {
         let n_pictures = print::counted(requests.len() as u64, "picture");
         print::line(format_args!("{n_pictures} in {}", args.out.display()))?;
@@ -153,13 +160,26 @@ impl Args {
     }
 }
 
+/// Files of a picture and of its depth.
+fn files(folder: &Path, ix: usize) -> [PathBuf; 2] {
+    [folder.join(format!("{ix:05}.png")), folder.join(format!("{ix:05}_depth.npy"))]
+}
+
+/// Refuses a folder that holds any of so many pictures: none is replaced.
+fn refuse_pictures(folder: &Path, n: usize) -> Result<(), BadArgument> {
+    match (0..n).flat_map(|ix| files(folder, ix)).find(|file| file.exists()) {
+        Some(file) => Err(BadArgument(format!("--out: {} is there already, name another folder", file.display()))),
+        None => Ok(()),
+    }
+}
+
 /// The picture's file, and the depth's.
 fn write(folder: &Path, ix: usize, picture: &Picture, with_depth: bool) -> anyhow::Result<(PathBuf, Option<PathBuf>)> {
     let [width, height] = picture.size_px;
-    let file = folder.join(format!("{ix:05}.png"));
+    let [file, depth] = files(folder, ix);
     image::save_buffer(&file, &picture.rgba_srgb, width, height, image::ExtendedColorType::Rgba8)
         .with_context(|| format!("cannot write {}", file.display()))?;
-    let depth = with_depth.then(|| folder.join(format!("{ix:05}_depth.npy")));
+    let depth = with_depth.then_some(depth);
     if let Some(depth) = &depth {
         write_npy(depth, picture).with_context(|| format!("cannot write {}", depth.display()))?;
     }
@@ -206,5 +226,8 @@ mod tests {
         assert_eq!(read.shape(), [3, 2]);
         assert_eq!(read.into_vec::<f32>().expect("floats"), picture.depth_m);
         assert!(file.ends_with("00007.png"));
+        refuse_pictures(folder.path(), 7).expect("the eighth is not among them");
+        let told = refuse_pictures(folder.path(), 8).expect_err("it is there").0;
+        assert!(told.contains("00007.png is there already"), "{told}");
     }
 }

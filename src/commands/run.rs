@@ -9,10 +9,10 @@ use crate::exit::{self, BadArgument, Exit, LackOfEvidence};
 use crate::feed::{Feed, Input};
 use crate::join::{Counts, Join, Refusal, Use};
 use crate::live::{Live, LiveOptions, Pace};
-use crate::method::{self, Recipe};
+use crate::method::{self, Kind, Recipe};
 use crate::open::{self, Devices, Opened};
 use crate::print;
-use crate::run_folder;
+use crate::run_folder::{self, MadeFolders};
 use crate::session::{self, Ending, Evaluators, Limits, Session, Tell};
 use crate::stands::{StandReport, Stands};
 use crate::stop::Stop;
@@ -25,7 +25,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, OnceLock};
 use trainer::gpu::Gpu;
 use trainer::splat::SplatOptions;
-use trainer::{Keyframe, Split};
+use trainer::{Keyframe, Method, Split};
 use viz::{Hub, Server, ServerConfig};
 
 /// Flags of `run`.
@@ -48,7 +48,7 @@ pub(crate) struct Args {
     /// Stop after S seconds, counted from the first image [default: run until Ctrl-C]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
-    /// Stop after N optimiser steps, or when the devices ended and there is nothing left to fuse
+    /// Stop after N optimiser steps (in lockstep one seed gives one result then), or when the devices ended and there is nothing left to fuse
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
     /// With a lockstep simulation or a recording only: steps between two keyframes [default: 10]
@@ -101,6 +101,12 @@ struct Particulars {
 
 /// Runs until a limit, the end of the devices, or Ctrl-C; saves the model, its keyframes and the settled rig file.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let mut made = MadeFolders::default();
+    let ended = drive(args, &mut made);
+    made.after(ended)
+}
+
+fn drive(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
     if let Some(out) = &args.out {
         run_folder::refuse_model(out)?;
     }
@@ -110,19 +116,21 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     args.training.check_for(&kinds)?;
     let evidence = Evidence { joints: true, drifts: rig.has_moving_base(), depth: false }; // Depth comes, but not at the start.
     args.training.check_learned(&kinds, evidence)?;
+    let cameras = args.training.refining(evidence, Refine::None)?.learn;
+    let count = args.training.count(HowMany::ToCap);
+    let options = SplatOptions { cameras, count, ..method::options(&rig.train, args.steps)? };
     let pace = args.pace(&rig)?;
+    let gpu = super::open_gpu()?;
+    let start = |kind: &Kind| Recipe { kind: *kind, options: options.clone() }.start(gpu.clone());
+    let methods: Vec<Box<dyn Method>> = kinds.iter().map(start).collect::<anyhow::Result<_>>()?;
     let hub = Hub::new();
     let server = Server::start(ServerConfig { listen: args.listen }, hub.clone())?;
     args.tell_address(&server.url())?;
 
     let Opened { rig, source, damage } = args.open(rig)?;
-    let folders = run_folder::make_each(args.out.as_deref(), &kinds, Some(&rig))?;
+    let folders = made.make_each(args.out.as_deref(), &kinds, Some(&rig))?;
     let feed = Feed::start(args.input(&rig, source)?, hub.clone(), stop.clone())?;
-    let gpu = super::open_gpu()?;
     let notes = notes(&gpu);
-    let cameras = args.training.refining(evidence, Refine::None)?.learn;
-    let count = args.training.count(HowMany::ToCap);
-    let options = SplatOptions { cameras, count, ..method::options(&rig.train, args.steps)? };
     let evaluators = Evaluators {
         at_marks: Evaluator::psnr_only(),
         most_at_marks: MOST_SCORED_AT_MARKS,
@@ -131,7 +139,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let limits = Limits { seconds: args.seconds, steps: args.steps };
     let clock = Clock::default();
     let mut sessions = Vec::new();
-    for (kind, folder) in kinds.iter().copied().zip(&folders) {
+    for ((kind, method), folder) in kinds.iter().copied().zip(methods).zip(&folders) {
         let about = About {
             method: kind.name(),
             data: args.record.as_deref().or(args.from.as_deref()),
@@ -142,7 +150,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             options: options.clone(),
         };
         let decisions = DecisionLog::create(folder, Settings::new(about))?;
-        let method = Recipe { kind, options: options.clone() }.start(gpu.clone())?;
         let tell = Tell::of_command(args.json);
         let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, tell)
             .with_stop(&stop)

@@ -1,8 +1,8 @@
 //! `fieldrig train`: a model of a dataset folder or a recording.
 
-use crate::checkpoints::{self, CheckpointArgs, Checkpoints};
+use crate::checkpoints::{self, CheckpointArgs, Checkpoints, OfData};
 use crate::clock::Clock;
-use crate::config::Rig;
+use crate::config::{Override, Rig};
 use crate::corrected_rig;
 use crate::data::{Data, DataArgs, Purpose};
 use crate::decisions::{About, DecisionLog, Settings};
@@ -12,12 +12,12 @@ use crate::exit::{self, BadArgument, Exit};
 use crate::method::{self, Kind, Recipe, Resumed};
 use crate::print;
 use crate::replay::Replay;
-use crate::run_folder;
+use crate::run_folder::{self, MadeFolders};
 use crate::session::{self, Ending, Evaluators, Limits, Session, Tell};
 use crate::stands::StandReport;
 use crate::stop::Stop;
 use crate::training;
-use crate::training_args::TrainingArgs;
+use crate::training_args::{REALIGN, TrainingArgs};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -37,7 +37,8 @@ pub(crate) struct Args {
     data: PathBuf,
     #[command(flatten)]
     training: TrainingArgs,
-    /// Go on from the checkpoint that an earlier run left in this folder, with the same data and its settings
+    /// Go on from the checkpoint that an earlier run left in this folder, with the same data, its settings, and its --scale, --holdout,
+    /// --keyframes and --rig where they are not given
     #[arg(long, value_name = "FOLDER", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "count", "plan_steps"])]
     resume: Option<PathBuf>,
     /// Repeat what the clock decided in an earlier run, and get the same model: with the settings of the log that it left
@@ -47,7 +48,7 @@ pub(crate) struct Args {
     /// Stop after S seconds of training, those before --resume included; loading and scoring do not count [default: 120, unless --steps is given]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
-    /// Stop after N optimiser steps, those before --resume included; no decision reads the clock then
+    /// Stop after N optimiser steps, those before --resume included; no decision reads the clock then, and one seed gives one result
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
     /// Steps over which learning slows down and the model grows [default: --steps, else 7000]
@@ -100,6 +101,12 @@ struct Particulars<'a> {
 
 /// Loads, trains until a limit or Ctrl-C, scores at the marks, saves.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let mut made = MadeFolders::default();
+    let ended = train(args, &mut made);
+    made.after(ended)
+}
+
+fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
     let started = Instant::now();
     let replay = args.replay_decisions.as_deref().map(Replay::load).transpose()?;
     let limits = match &replay {
@@ -111,20 +118,32 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     let stop = Stop::on_ctrl_c()?;
     let checkpoint = args.resume.as_deref().map(checkpoints::read).transpose()?;
+    let whose = args.resume.as_deref().map(|folder| format!("the checkpoint in {}", folder.display()));
+    if let (Some(checkpoint), Some(whose)) = (&checkpoint, &whose) {
+        refuse_over(limits, checkpoint, whose)?;
+    }
     let depth_from = args.depth_from.as_deref().map(DepthSource::find).transpose()?;
     let depth_sum = depth_from.as_ref().map(|source| source.sha256.as_str());
     if let Some(replay) = &replay {
         replay.check_depth_from(depth_sum)?;
     }
-    if let (Some(checkpoint), Some(folder)) = (&checkpoint, &args.resume) {
-        let whose = format!("the checkpoint in {}", folder.display());
-        depth_from::check_same(&whose, checkpoint.depth_from.as_deref(), depth_sum)?;
+    let (mut images, mut overrides) = (args.images.clone(), args.training.overrides());
+    let mut realign = args.training.realign();
+    if let (Some(checkpoint), Some(whose)) = (&checkpoint, &whose) {
+        depth_from::check_same(whose, checkpoint.depth_from.as_deref(), depth_sum)?;
+        if replay.is_none() {
+            images = images.after(whose, &checkpoint.data_flags)?;
+        }
+        realign = checkpoint.data_flags.get(REALIGN).map(|is_on| is_on == "true");
+        overrides.extend(realign.map(|is_on| Override::new(REALIGN, is_on)));
+    } else if replay.is_none() {
+        training::check_before_data(&args.training, &args.data, &images)?;
     }
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
     let evaluators = Evaluators { at_marks: evaluator.clone(), most_at_marks: usize::MAX, at_end: evaluator };
     let mut data = match &replay {
         Some(replay) => replay.load_data(&args.data, args.images.rig.clone(), args.json)?,
-        None => Data::load(&args.data, &args.images, Purpose::Training, &args.training.overrides(), args.json)?,
+        None => Data::load(&args.data, &images, Purpose::Training, &overrides, args.json)?,
     };
     if let Some(file) = &args.write_rig {
         let Some(rig) = &data.rig else {
@@ -148,7 +167,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     models.iter_mut().try_for_each(|model| model.method.prepare())?;
     let kinds: Vec<Kind> = models.iter().map(|model| model.recipe.kind).collect();
-    let folders = run_folder::make_each(args.out(), &kinds, data.rig.as_ref())?;
+    let folders = made.make_each(args.out(), &kinds, data.rig.as_ref())?;
+    let mut flags = images.flags();
+    flags.extend(realign.map(|is_on| (REALIGN.to_owned(), is_on.to_string())));
+    let of_data = OfData { depth_from: depth_sum.map(str::to_owned), flags };
 
     let rest = models[0].rest.clone(); // All begin with the same images; only one alone goes on from a checkpoint.
     let is_rest = |keyframe: &Arc<Keyframe>| rest.iter().any(|other| Arc::ptr_eq(other, keyframe));
@@ -161,8 +183,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             method: kind.name(),
             data: Some(&args.data),
             adapter: gpu.describe(),
-            scale: args.scale(&data, replay.as_ref()),
-            depth_from: depth_sum.map(str::to_owned),
+            scale: scale(&images, &data, replay.as_ref()),
+            depth_from: of_data.depth_from.clone(),
             from_step,
             options,
         };
@@ -174,7 +196,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         let checkpoints = Checkpoints::new(folder, args.checkpoints);
         let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, tell)
             .with_stop(&stop)
-            .with_checkpoints(checkpoints.map(|to| to.with_depth_from(depth_sum.map(str::to_owned))))
+            .with_checkpoints(checkpoints.map(|to| to.with_data(of_data.clone())))
             .with_profile(args.profile)
             .with_decisions(decisions);
         sessions.push(match (&kinds[..], &checkpoint) {
@@ -211,9 +233,27 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     };
     session::finish(sessions.into_iter().zip(folders).zip(seeds).map(ending).collect())?;
     if let Some(file) = &args.write_rig {
-        write_rig(&Data::rig_as_given(&args.data, &args.images)?, alignment.as_ref(), file)?;
+        write_rig(&Data::rig_as_given(&args.data, &images)?, alignment.as_ref(), file)?;
     }
     Ok(exit::after(&data.losses))
+}
+
+/// Refuses limits in seconds that are over before training goes on.
+fn refuse_over(limits: Limits, checkpoint: &Checkpoint, whose: &str) -> Result<(), BadArgument> {
+    match limits.seconds.filter(|seconds| *seconds <= checkpoint.seconds) {
+        Some(seconds) => Err(BadArgument(format!(
+            "--seconds {seconds}: {whose} has been trained for {:.1} s, which count too; name more than that",
+            checkpoint.seconds
+        ))),
+        None => Ok(()),
+    }
+}
+
+/// Share of their size that images were shrunk to.
+fn scale(images: &DataArgs, data: &Data, replay: Option<&Replay>) -> f64 {
+    let of_rig = data.rig.as_ref().map(|rig| rig.train.scale);
+    let of_log = replay.map(|replay| replay.decisions.settings.scale);
+    of_rig.or(of_log).or(images.scale).unwrap_or(1.0)
 }
 
 /// Writes the rig file, and says where nothing changed in it.
@@ -259,13 +299,6 @@ impl Args {
     fn out(&self) -> Option<&Path> {
         let unfinished = || self.resume.as_deref().filter(|folder| run_folder::refuse_model(folder).is_ok());
         self.out.as_deref().or_else(unfinished)
-    }
-
-    /// Share of their size that images were shrunk to.
-    fn scale(&self, data: &Data, replay: Option<&Replay>) -> f64 {
-        let of_rig = data.rig.as_ref().map(|rig| rig.train.scale);
-        let of_log = replay.map(|replay| replay.decisions.settings.scale);
-        of_rig.or(of_log).or(self.images.scale).unwrap_or(1.0)
     }
 
     /// Says what is not as the caller may expect.

@@ -5,6 +5,7 @@
 use crate::Error;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
 use std::fmt::{Debug, Formatter};
 use std::fs::File;
 use std::io::Write;
@@ -26,6 +27,8 @@ pub struct Checkpoint {
     pub seconds: f64,
     /// SHA-256 of the model that keyframes without depth had theirs drawn from, where there was one.
     pub depth_from: Option<String>,
+    /// Flags that its keyframes were made by, for its caller to make them again: values by names.
+    pub data_flags: BTreeMap<String, String>,
     /// The method's state but for its arrays.
     pub state: serde_json::Value,
     /// What is too large for a description, little endian.
@@ -52,6 +55,8 @@ struct Description {
     seconds: f64,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     depth_from: Option<String>,
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    data_flags: BTreeMap<String, String>,
     state: serde_json::Value,
     arrays: Vec<Length>,
 }
@@ -83,7 +88,7 @@ impl Debug for PendingCheckpoint {
 impl Checkpoint {
     /// What a method tells of itself; how long it had been trained for, and on what, is for its caller to say.
     pub(crate) fn new(method: &str, state: serde_json::Value, arrays: Vec<Array>) -> Self {
-        Self { method: method.to_owned(), seconds: 0.0, depth_from: None, state, arrays }
+        Self { method: method.to_owned(), seconds: 0.0, depth_from: None, data_flags: BTreeMap::new(), state, arrays }
     }
 
     /// Writes the file beside its place, waits until the disk has it, and moves it there: whatever happens, either the
@@ -133,6 +138,7 @@ impl Checkpoint {
             method: self.method.clone(),
             seconds: self.seconds,
             depth_from: self.depth_from.clone(),
+            data_flags: self.data_flags.clone(),
             state: self.state.clone(),
             arrays: lengths.collect(),
         })?;
@@ -181,8 +187,8 @@ impl Checkpoint {
             arrays.push(Array { name, bytes: array.to_vec() });
             rest = after;
         }
-        let Description { method, seconds, depth_from, state, .. } = description;
-        Ok(Self { method, seconds, depth_from, state, arrays })
+        let Description { method, seconds, depth_from, data_flags, state, .. } = description;
+        Ok(Self { method, seconds, depth_from, data_flags, state, arrays })
     }
 }
 
@@ -196,6 +202,7 @@ mod tests {
             method: "splat".into(),
             seconds: 0.1 + 0.2,
             depth_from: Some("5ad1".into()),
+            data_flags: BTreeMap::from([("scale".into(), "0.5".into())]),
             state: serde_json::json!({ "step": u64::MAX, "size_m": 1.0 / 3.0 }),
             arrays: arrays.map(|(name, bytes)| Array { name: name.into(), bytes }).into(),
         }

@@ -54,8 +54,10 @@ pub enum Error {
         limit_bytes: u32,
     },
     /// Less memory than the smallest model of the method takes.
-    #[error("max_bytes = {max_bytes}: the smallest neural field takes {least_bytes} bytes")]
+    #[error("max_bytes = {max_bytes}: the smallest {model} takes {least_bytes} bytes")]
     BudgetTooSmall {
+        /// The method's model, in words.
+        model: &'static str,
         /// Bytes allowed.
         max_bytes: u64,
         /// Bytes needed.

@@ -83,7 +83,8 @@ impl Sizes {
                 return Ok(Self { n_cells: shape.n_cells, log2_entries, has_depth, refines, effort });
             }
             if log2_entries == LEAST_LOG2_ENTRIES {
-                return Err(Error::BudgetTooSmall { max_bytes, least_bytes: n_entries * BYTES_PER_ENTRY });
+                let least_bytes = n_entries * BYTES_PER_ENTRY;
+                return Err(Error::BudgetTooSmall { model: "neural field", max_bytes, least_bytes });
             }
             log2_entries -= 1;
         }

@@ -12,7 +12,7 @@ use std::collections::BTreeSet;
 /// Bytes of a block on the GPU: distances, colors, its place, and whether it changed or is seen.
 pub(crate) const BYTES_PER_BLOCK: u64 = 512 * (4 + 8) + 16 + 4 + 4;
 /// Bytes of a chunk: a key and the slots of its blocks.
-const BYTES_PER_CHUNK: u64 = 4 + 4 * 512;
+pub(crate) const BYTES_PER_CHUNK: u64 = 4 + 4 * 512;
 /// Blocks gathered at once.
 const GATHERED: usize = 2048;
 

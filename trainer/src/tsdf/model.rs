@@ -30,6 +30,11 @@ use std::time::Instant;
 const FRAMES_PER_SUBMIT: usize = 4;
 /// Room at the start.
 const FIRST_CAPACITY: Capacity = Capacity { n_blocks: 4096, n_chunks: 512 };
+/// Fewer blocks show no scene: voxels are chosen so that one image takes a tenth of them.
+const FEWEST_BLOCKS: u32 = 256;
+/// The table at the start, and the fewest blocks.
+pub(super) const LEAST_BYTES: u64 =
+    FIRST_CAPACITY.n_chunks as u64 * buffers::BYTES_PER_CHUNK + FEWEST_BLOCKS as u64 * buffers::BYTES_PER_BLOCK;
 
 /// A colored distance field built from keyframes with depth.
 ///
@@ -73,8 +78,18 @@ struct InFlight {
 }
 
 impl TsdfModel {
-    /// An empty model.
+    /// An empty model; refused where it may not even have the memory of the smallest.
     pub fn new(gpu: Arc<Gpu>, options: TsdfOptions) -> Result<Self, Error> {
+        match options.max_bytes {
+            Some(max_bytes) if max_bytes < LEAST_BYTES => {
+                Err(Error::BudgetTooSmall { model: "distance field", max_bytes, least_bytes: LEAST_BYTES })
+            }
+            _ => Self::within_any_budget(gpu, options),
+        }
+    }
+
+    /// An empty model; where it may have less memory than the smallest it leaves out what it finds no room for.
+    pub(super) fn within_any_budget(gpu: Arc<Gpu>, options: TsdfOptions) -> Result<Self, Error> {
         Ok(Self {
             pipelines: Pipelines::new(&gpu)?,
             lattice: None,
@@ -136,9 +151,15 @@ impl TsdfModel {
         Ok(blocks)
     }
 
-    /// Most blocks the GPU may hold.
+    /// Most blocks the GPU may hold beside the table that finds them.
     fn most_blocks(&self) -> u32 {
-        let by_bytes = self.options.max_bytes.map_or(u64::MAX, |bytes| bytes / buffers::BYTES_PER_BLOCK);
+        self.most_blocks_beside(self.field.as_ref().map_or(FIRST_CAPACITY, |field| field.capacity).n_chunks)
+    }
+
+    fn most_blocks_beside(&self, n_chunks: u32) -> u32 {
+        let table_bytes = u64::from(n_chunks) * buffers::BYTES_PER_CHUNK;
+        let of_blocks = |bytes: u64| bytes.saturating_sub(table_bytes) / buffers::BYTES_PER_BLOCK;
+        let by_bytes = self.options.max_bytes.map_or(u64::MAX, of_blocks);
         buffers::most_blocks(&self.gpu).min(u32::try_from(by_bytes).unwrap_or(u32::MAX)).max(1)
     }
 
@@ -226,12 +247,13 @@ impl TsdfModel {
     fn make_room(&mut self, counters: &[u32]) -> Result<(), Error> {
         let (Some(lattice), Some(field)) = (&self.lattice, &self.field) else { return Ok(()) };
         let mut capacity = field.capacity;
-        let (need, most) = (counters[status::N_BLOCKS], self.most_blocks());
         if counters[status::TABLE_FULL] != 0 {
             capacity.n_chunks *= 2;
         }
+        let (need, most) = (counters[status::N_BLOCKS], self.most_blocks_beside(capacity.n_chunks));
         if need > capacity.n_blocks {
-            capacity.n_blocks = need.max(capacity.n_blocks.saturating_add(capacity.n_blocks / 2)).min(most);
+            let wanted = need.max(capacity.n_blocks.saturating_add(capacity.n_blocks / 2));
+            capacity.n_blocks = wanted.min(most).max(capacity.n_blocks);
         }
         if capacity != field.capacity {
             log::debug!("tsdf: room for {capacity:?}");

@@ -16,7 +16,8 @@ pub struct TsdfOptions {
     pub max_depth_m: f64,
     /// Most weight a voxel has, in looks from 1 m; the smaller, the sooner moved things fade. Up to 255.
     pub max_weight: f64,
-    /// Most bytes of GPU memory the blocks may take; past them those furthest from the camera wait in host memory.
+    /// Most bytes of GPU memory that blocks and the table that finds them may take; past them blocks furthest from the camera wait in
+    /// host memory. (What the table grows by once all room is taken comes on top.)
     pub max_bytes: Option<u64>,
 }
 

@@ -291,8 +291,15 @@ fn half_the_memory_loses_nothing() {
     }
     let mut plenty = fused(options(), &keyframes);
     let n_all = plenty.progress().primitives;
-    let max_bytes = Some(super::buffers::BYTES_PER_BLOCK * n_all * 6 / 10);
-    let mut scarce = fused(TsdfOptions { max_bytes, ..options() }, &keyframes);
+    let within = |max_bytes| {
+        let options = TsdfOptions { max_bytes: Some(max_bytes), ..options() };
+        let mut model = TsdfModel::within_any_budget(gpu(), options).unwrap();
+        keyframes.iter().for_each(|keyframe| model.push(keyframe.clone()).unwrap());
+        fuse_all(&mut model);
+        model
+    };
+    let table_bytes = plenty.progress().bytes - super::buffers::BYTES_PER_BLOCK * n_all;
+    let mut scarce = within(table_bytes + super::buffers::BYTES_PER_BLOCK * n_all * 6 / 10);
     assert_eq!(scarce.n_refused(), 0);
     assert!(scarce.n_waiting() > 0);
     assert!(scarce.blocks().unwrap() == plenty.blocks().unwrap());
@@ -302,9 +309,20 @@ fn half_the_memory_loses_nothing() {
     }
     assert!(scarce.mesh().unwrap() == plenty.mesh().unwrap());
     // Less than one image needs: it is left out, and said so.
-    let mut tiny = fused(TsdfOptions { max_bytes: Some(20_000), ..options() }, &keyframes);
+    let mut tiny = within(20_000);
     assert_eq!((tiny.n_refused(), tiny.progress().step), (8, 8));
     assert!(tiny.render(&scenes::request(view_of(&keyframes[0]))).is_ok());
+}
+
+#[test]
+fn a_budget_holds_all_that_is_told_or_is_refused_with_the_least() {
+    let least = super::model::LEAST_BYTES;
+    let of = |max_bytes| TsdfOptions { max_bytes: Some(max_bytes), ..TsdfOptions::default() };
+    let told = TsdfModel::new(gpu(), of(least - 1)).unwrap_err().to_string();
+    assert!(told.contains(&least.to_string()) && told.contains("distance field"), "{told}");
+    let small = fused(of(least), &ball_on_floor(4));
+    assert_eq!(small.n_refused(), 0);
+    assert!((least / 2..=least).contains(&small.progress().bytes), "{:?}", small.progress());
 }
 
 #[test]

@@ -76,7 +76,7 @@ impl TsdfModel {
         let state: State =
             serde_json::from_value(checkpoint.state.clone()).map_err(|error| bad_state(error.to_string()))?;
         let blocks = blocks_of(checkpoint, state.n_blocks)?;
-        let mut model = Self::new(gpu, state.options)?;
+        let mut model = Self::within_any_budget(gpu, state.options)?;
         let most = model.most_blocks() as usize;
         model.due = blocks.keys().copied().collect();
         let mut resident = blocks;
