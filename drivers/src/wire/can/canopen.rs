@@ -4,7 +4,7 @@
 //! codes), 7.2.8 (NMT, heartbeat), 7.5.2 (objects); the same bytes in christiansandberg/canopen. Transfers in segments and blocks
 //! are refused: no object that a drive needs is longer than four bytes.
 
-use super::{CanError, Frame, Id};
+use super::{CanError, Frame, Id, defined};
 
 /// How messages are called in errors.
 const SDO: &str = "SDO answer";
@@ -167,8 +167,7 @@ pub fn decode_heartbeat(frame: &Frame) -> Result<(Node, NodeState), CanError> {
         return Err(CanError::Length { message: HEARTBEAT, got_bytes: bytes.len(), expected_bytes: 1 });
     };
     let all = [NodeState::BootUp, NodeState::Stopped, NodeState::Operational, NodeState::PreOperational];
-    let found = all.into_iter().find(|known| *known as u8 == state);
-    Ok((node, found.ok_or(CanError::Undefined { field: "the state of the node", raw: state.into() })?))
+    Ok((node, defined("the state of the node", state.into(), &all, |known| known as u32)?))
 }
 
 /// Asks a node for an object.

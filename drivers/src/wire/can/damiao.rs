@@ -6,7 +6,7 @@
 //! motor's feedback identifier (register `MST_ID`).
 
 use super::mit::{self, Command, Limits, Motion};
-use super::{CanError, Frame, Id, eight};
+use super::{CanError, Frame, Id, defined, eight};
 
 /// Identifier of what is about registers.
 const REGISTER_ID: u32 = 0x7FF;
@@ -249,11 +249,7 @@ pub fn encode_register(message: &RegisterMessage, answer_id: Option<Id>) -> Resu
 /// Reads a motor's answer about a register.
 pub fn decode_register(frame: &Frame) -> Result<RegisterMessage, CanError> {
     let [low, high, code, number, a, b, c, d] = eight(frame, REGISTER, false)?;
-    let undefined = |field, raw: u8| CanError::Undefined { field, raw: raw.into() };
-    let register = || {
-        let found = Register::ALL.into_iter().find(|register| *register as u8 == number);
-        found.ok_or_else(|| undefined("the register", number))
-    };
+    let register = || defined("the register", number.into(), &Register::ALL, |known| known as u32);
     let value = |register: Register| match register.is_whole() {
         true => Value::Whole(u32::from_le_bytes([a, b, c, d])),
         false => Value::Real(f32::from_le_bytes([a, b, c, d])),
@@ -261,7 +257,7 @@ pub fn decode_register(frame: &Frame) -> Result<RegisterMessage, CanError> {
     let access = match code {
         0x33 => register().map(|register| Access::Told(register, value(register)))?,
         0x55 => register().map(|register| Access::Write(register, value(register)))?,
-        other => return Err(undefined("the kind of access", other)),
+        other => return Err(CanError::Undefined { field: "the kind of access", raw: other.into() }),
     };
     Ok(RegisterMessage { motor: u16::from_le_bytes([low, high]), access })
 }
@@ -269,10 +265,9 @@ pub fn decode_register(frame: &Frame) -> Result<RegisterMessage, CanError> {
 /// Reads a motor's feedback. An answer about a register comes under the same identifier: the caller knows whether it asked.
 pub fn decode_feedback(frame: &Frame, limits: &Limits) -> Result<Feedback, CanError> {
     let [head, a, b, c, d, e, drive_celsius, rotor_celsius] = eight(frame, FEEDBACK, false)?;
-    let status = Status::ALL.into_iter().find(|status| *status as u8 == head >> 4);
     Ok(Feedback {
         motor_low: head & 0xF,
-        status: status.ok_or(CanError::Undefined { field: "the status", raw: (head >> 4).into() })?,
+        status: defined("the status", (head >> 4).into(), &Status::ALL, |known| known as u32)?,
         motion: mit::decode_motion([a, b, c, d, e], limits),
         drive_celsius,
         rotor_celsius,

@@ -67,23 +67,29 @@ pub struct Motion {
     pub torque_nm: f64,
 }
 
-/// How a field of MIT mode is cut into counts.
-struct Scales {
-    position: Scale,
-    velocity: Scale,
-    kp: Scale,
-    kd: Scale,
-    torque: Scale,
+/// How the numbers of a command are cut into counts.
+pub(super) struct Scales {
+    pub(super) position: Scale,
+    pub(super) velocity: Scale,
+    pub(super) kp: Scale,
+    pub(super) kd: Scale,
+    pub(super) torque: Scale,
 }
 
 impl Scales {
+    /// Of MIT mode.
     fn of(limits: &Limits) -> Self {
+        Self::with_bits(limits, 12)
+    }
+
+    /// A position of 16 bits, and all else of so many.
+    pub(super) fn with_bits(limits: &Limits, n_bits: u32) -> Self {
         Self {
             position: Scale::symmetric(limits.position_rad, 16),
-            velocity: Scale::symmetric(limits.velocity_rad_s, 12),
-            kp: Scale::positive(limits.kp_nm_rad, 12),
-            kd: Scale::positive(limits.kd_nm_s_rad, 12),
-            torque: Scale::symmetric(limits.torque_nm, 12),
+            velocity: Scale::symmetric(limits.velocity_rad_s, n_bits),
+            kp: Scale::positive(limits.kp_nm_rad, n_bits),
+            kd: Scale::positive(limits.kd_nm_s_rad, n_bits),
+            torque: Scale::symmetric(limits.torque_nm, n_bits),
         }
     }
 }

@@ -107,6 +107,11 @@ pub enum CanError {
     },
 }
 
+/// The one of `all` whose number a field holds.
+fn defined<T: Copy>(field: &'static str, raw: u32, all: &[T], number: impl Fn(T) -> u32) -> Result<T, CanError> {
+    all.iter().copied().find(|known| number(*known) == raw).ok_or(CanError::Undefined { field, raw })
+}
+
 /// The eight bytes of a data frame with an 11-bit or 29-bit identifier; anything else is refused.
 fn eight(frame: &Frame, message: &'static str, extended: bool) -> Result<[u8; 8], CanError> {
     let id = frame.id();

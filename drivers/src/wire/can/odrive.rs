@@ -4,7 +4,7 @@
 //! firmware 0.6.10 (heartbeat, errors, torques, endpoints, temperature). Turns on the wire are radians here. What a node tells
 //! comes by itself at the rates set in its `can.config` or `axis.config.can`, or when asked with a remote frame.
 
-use super::{CanError, Frame, Id};
+use super::{CanError, Frame, Id, defined};
 use std::f64::consts::TAU;
 
 /// How frames of a node are called in errors.
@@ -248,9 +248,8 @@ pub fn decode_answer(frame: &Frame) -> Result<(Node, Answer), CanError> {
     };
     let is = |code: Code| low & 0x1F == code as u8;
     let answer = if is(Code::Heartbeat) {
-        let state = State::ALL.into_iter().find(|state| *state as u8 == e);
-        let undefined = CanError::Undefined { field: "the state of the axis", raw: e.into() };
-        Answer::Heartbeat { errors: words.0, state: state.ok_or(undefined)? }
+        let state = defined("the state of the axis", e.into(), &State::ALL, |known| known as u32)?;
+        Answer::Heartbeat { errors: words.0, state }
     } else if is(Code::Errors) {
         Answer::Errors { active: words.0, disarm_reason: words.1 }
     } else if is(Code::EndpointAnswer) {

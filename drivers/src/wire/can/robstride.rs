@@ -5,17 +5,18 @@
 //! the manuals; the table of the Python package `robstride_dynamics` differs for RS00, RS03, RS05 and RS06 and gives torques of an
 //! RS05 three times too high (motorbridge/motorbridge pull request 11). RS02 firmware up to 0.2.2.11 counts 12.5 rad as the end.
 
-use super::mit::{Command, Limits, Motion};
-use super::scale::Scale;
-use super::{CanError, Frame, Id, eight};
+mod parameter;
+
+pub use parameter::{Parameter, Value, timeout};
+
+use super::mit::{Command, Limits, Motion, Scales};
+use super::{CanError, Frame, Id, defined, eight};
 use std::f64::consts::PI;
 
 /// How frames that come from a motor are called in errors.
 const MESSAGE: &str = "answer of a Robstride motor";
 /// What some orders carry so that nothing else is taken for them.
 const SEAL: [u8; 6] = [1, 2, 3, 4, 5, 6];
-/// Counts of `canTimeout` a second.
-const TIMEOUT_TICKS_HZ: f64 = 20_000.0;
 /// The number that a motor's answer to [`Request::Identify`] goes to.
 const EVERYONE: u8 = 0xFE;
 
@@ -66,63 +67,6 @@ enum Communication {
     Fault = 21,
     Store = 22,
     ActiveReport = 24,
-}
-
-/// A parameter that this program reads or writes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u16)]
-pub enum Parameter {
-    /// `run_mode`: 0 obeys motion commands.
-    RunMode = 0x7005,
-    /// `limit_torque`, N m.
-    TorqueLimit = 0x700B,
-    /// `limit_cur`, A.
-    CurrentLimit = 0x7018,
-    /// `mechPos`: the output shaft, rad; read only.
-    Position = 0x7019,
-    /// `mechVel`: the output shaft, rad/s; read only.
-    Velocity = 0x701B,
-    /// `VBUS`: supply, V; read only.
-    Supply = 0x701C,
-    /// `loc_kp`: stiffness of the motor's own position mode.
-    PositionGain = 0x701E,
-    /// `EPScan_time`: how often the motor reports by itself, 1 is every 10 ms and each more 5 ms longer.
-    ReportInterval = 0x7026,
-    /// `canTimeout`: how long it obeys its last command, 20 000 a second; 0 is for ever.
-    Timeout = 0x7028,
-}
-
-impl Parameter {
-    const ALL: [Self; 9] = [
-        Self::RunMode,
-        Self::TorqueLimit,
-        Self::CurrentLimit,
-        Self::Position,
-        Self::Velocity,
-        Self::Supply,
-        Self::PositionGain,
-        Self::ReportInterval,
-        Self::Timeout,
-    ];
-
-    /// How many bytes of a whole number it holds; `None` where it is a real one.
-    fn whole_bytes(self) -> Option<usize> {
-        match self {
-            Self::RunMode => Some(1),
-            Self::ReportInterval => Some(2),
-            Self::Timeout => Some(4),
-            _ => None,
-        }
-    }
-}
-
-/// What a parameter holds.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Value {
-    /// In parameters of codes and ticks.
-    Whole(u32),
-    /// In parameters of SI values.
-    Real(f32),
 }
 
 /// What a host sends.
@@ -231,18 +175,6 @@ pub struct Feedback {
     pub winding_celsius: f64,
 }
 
-/// The value of [`Parameter::Timeout`] for a time, rounded up so that no motor stops earlier than asked for; 0 never stops it.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within u32 by the check")]
-pub fn timeout(timeout_secs: f64) -> Result<Value, CanError> {
-    let upper = f64::from(u32::MAX) / TIMEOUT_TICKS_HZ;
-    match (0.0..=upper).contains(&timeout_secs) {
-        true if timeout_secs == 0.0 => Ok(Value::Whole(0)),
-        // Less a hair, so that whole ticks stay what they are; never 0, which would be for ever.
-        true => Ok(Value::Whole((timeout_secs * TIMEOUT_TICKS_HZ - 1e-6).ceil().max(1.0) as u32)),
-        false => Err(CanError::Range { field: "the timeout in seconds", value: timeout_secs, lower: 0.0, upper }),
-    }
-}
-
 /// The frame of a request from host number `host` to motor `motor`.
 pub fn encode_request(host: u8, motor: u8, request: &Request, limits: &Limits) -> Result<Frame, CanError> {
     let host_only = u16::from(host);
@@ -250,7 +182,7 @@ pub fn encode_request(host: u8, motor: u8, request: &Request, limits: &Limits) -
     let (kind, middle, bytes) = match *request {
         Request::Identify => (Communication::Identity, host_only, [0; 8]),
         Request::Move(command) => {
-            let scales = Scales::of(limits);
+            let scales = Scales::with_bits(limits, 16);
             let [p1, p0] = scales.position.raw_from_value("the position", command.position_rad)?.to_be_bytes();
             let [v1, v0] = scales.velocity.raw_from_value("the velocity", command.velocity_rad_s)?.to_be_bytes();
             let [kp1, kp0] = scales.kp.raw_from_value("kp", command.kp_nm_rad)?.to_be_bytes();
@@ -261,9 +193,9 @@ pub fn encode_request(host: u8, motor: u8, request: &Request, limits: &Limits) -
         Request::Enable => (Communication::Enable, host_only, [0; 8]),
         Request::Stop { clear_fault } => (Communication::Stop, host_only, [clear_fault.into(), 0, 0, 0, 0, 0, 0, 0]),
         Request::SetZero => (Communication::SetZero, host_only, [1, 0, 0, 0, 0, 0, 0, 0]),
-        Request::Read(parameter) => (Communication::ReadParameter, host_only, parameter_bytes(parameter, [0; 4])),
+        Request::Read(parameter) => (Communication::ReadParameter, host_only, parameter.bytes([0; 4])),
         Request::Write(parameter, value) => {
-            (Communication::WriteParameter, host_only, parameter_bytes(parameter, value_bytes(parameter, value)?))
+            (Communication::WriteParameter, host_only, parameter.bytes(parameter.value_bytes(value)?))
         }
         Request::Store => (Communication::Store, host_only, sealed(7)),
         Request::ReportActively(on) => (Communication::ActiveReport, host_only, sealed(on.into())),
@@ -284,12 +216,12 @@ pub fn decode_answer(frame: &Frame, host: u8, limits: &Limits) -> Result<Answer,
     }
     let [a, b, c, d, e, f, g, h] = bytes;
     if kind == Communication::Feedback as u8 || kind == Communication::ActiveReport as u8 {
-        let mode = [Mode::Reset, Mode::Calibration, Mode::Run].into_iter().find(|mode| *mode as u8 == flags >> 6);
-        let scales = Scales::of(limits);
+        let modes = [Mode::Reset, Mode::Calibration, Mode::Run];
+        let scales = Scales::with_bits(limits, 16);
         return Ok(Answer::Feedback(Feedback {
             motor,
             is_unasked: kind == Communication::ActiveReport as u8,
-            mode: mode.ok_or(CanError::Undefined { field: "the mode", raw: (flags >> 6).into() })?,
+            mode: defined("the mode", (flags >> 6).into(), &modes, |known| known as u32)?,
             faults: Faults(flags & 0x3F),
             motion: Motion {
                 position_rad: scales.position.value_from_raw(u16::from_be_bytes([a, b])),
@@ -304,14 +236,8 @@ pub fn decode_answer(frame: &Frame, host: u8, limits: &Limits) -> Result<Answer,
         if flags != 0 {
             return Err(CanError::Refused { parameter: index.into() });
         }
-        let parameter = Parameter::ALL.into_iter().find(|parameter| *parameter as u16 == index);
-        let parameter = parameter.ok_or(CanError::Undefined { field: "the parameter", raw: index.into() })?;
-        let value = match parameter.whole_bytes() {
-            Some(1) => Value::Whole(e.into()),
-            Some(2) => Value::Whole(u16::from_le_bytes([e, f]).into()),
-            Some(_) => Value::Whole(u32::from_le_bytes([e, f, g, h])),
-            None => Value::Real(f32::from_le_bytes([e, f, g, h])),
-        };
+        let parameter = Parameter::of_index(index)?;
+        let value = parameter.value([e, f, g, h]);
         return Ok(Answer::Parameter { motor, parameter, value });
     }
     if kind == Communication::Fault as u8 {
@@ -324,7 +250,7 @@ pub fn decode_answer(frame: &Frame, host: u8, limits: &Limits) -> Result<Answer,
 /// The frame of a feedback to host number `host`, for motors that are simulated; the temperature must be 0 to 6553.5.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked to be within 16 bits first")]
 pub fn encode_feedback(host: u8, feedback: &Feedback, limits: &Limits) -> Result<Frame, CanError> {
-    let scales = Scales::of(limits);
+    let scales = Scales::with_bits(limits, 16);
     let [a, b] = scales.position.raw_from_value("the position", feedback.motion.position_rad)?.to_be_bytes();
     let [c, d] = scales.velocity.raw_from_value("the velocity", feedback.motion.velocity_rad_s)?.to_be_bytes();
     let [e, f] = scales.torque.raw_from_value("the torque", feedback.motion.torque_nm)?.to_be_bytes();
@@ -341,40 +267,6 @@ pub fn encode_feedback(host: u8, feedback: &Feedback, limits: &Limits) -> Result
 
 fn id_of(kind: Communication, middle: u16, to: u8) -> Result<Id, CanError> {
     Id::extended(u32::from(kind as u8) << 24 | u32::from(middle) << 8 | u32::from(to))
-}
-
-fn parameter_bytes(parameter: Parameter, value: [u8; 4]) -> [u8; 8] {
-    let ([low, high], [a, b, c, d]) = ((parameter as u16).to_le_bytes(), value);
-    [low, high, 0, 0, a, b, c, d]
-}
-
-fn value_bytes(parameter: Parameter, value: Value) -> Result<[u8; 4], CanError> {
-    match (parameter.whole_bytes(), value) {
-        (Some(n_bytes), Value::Whole(whole)) if n_bytes == 4 || whole < 1 << (8 * n_bytes) => Ok(whole.to_le_bytes()),
-        (None, Value::Real(real)) if real.is_finite() => Ok(real.to_le_bytes()),
-        _ => Err(CanError::Undefined { field: "the value for the parameter", raw: parameter as u32 }),
-    }
-}
-
-/// All fields have 16 bits.
-struct Scales {
-    position: Scale,
-    velocity: Scale,
-    kp: Scale,
-    kd: Scale,
-    torque: Scale,
-}
-
-impl Scales {
-    fn of(limits: &Limits) -> Self {
-        Self {
-            position: Scale::symmetric(limits.position_rad, 16),
-            velocity: Scale::symmetric(limits.velocity_rad_s, 16),
-            kp: Scale::positive(limits.kp_nm_rad, 16),
-            kd: Scale::positive(limits.kd_nm_s_rad, 16),
-            torque: Scale::symmetric(limits.torque_nm, 16),
-        }
-    }
 }
 
 #[cfg(test)]
@@ -456,12 +348,6 @@ mod tests {
         assert!(asked(Request::Write(Parameter::TorqueLimit, Value::Real(f32::NAN))).is_err());
         let none = Command { torque_nm: f64::NAN, ..Command::default() };
         assert_eq!(asked(Request::Move(none)), Err(CanError::NotFinite { field: "the torque" }));
-        for secs in [-1e-3, f64::NAN, f64::INFINITY, 1e9] {
-            assert!(matches!(timeout(secs), Err(CanError::Range { .. })), "{secs}");
-        }
-        for (secs, ticks) in [(0.0, 0), (1e-12, 1), (0.1, 2000), (1.0, 20_000)] {
-            assert_eq!(timeout(secs), Ok(Value::Whole(ticks)), "{secs}");
-        }
     }
 
     #[test]

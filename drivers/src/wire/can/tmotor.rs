@@ -5,7 +5,7 @@
 //! are data and a rig may give its own.
 
 use super::mit::{self, Command, Limits, Motion};
-use super::{CanError, Frame, Id};
+use super::{CanError, Frame, Id, defined};
 
 /// A model whose limits are known.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -134,8 +134,7 @@ pub fn decode_feedback(frame: &Frame, limits: &Limits, thermometer: Thermometer)
     let health = match *rest {
         [temperature, code] => {
             let zero = if thermometer == Thermometer::Less40 { 40.0 } else { 0.0 };
-            let undefined = CanError::Undefined { field: "the error code", raw: code.into() };
-            let fault = Fault::ALL.into_iter().find(|fault| *fault as u8 == code).ok_or(undefined)?;
+            let fault = defined("the error code", code.into(), &Fault::ALL, |known| known as u32)?;
             Some(Health { drive_celsius: f64::from(temperature) - zero, fault })
         }
         _ => None,
