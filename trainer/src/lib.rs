@@ -5,6 +5,7 @@ mod aligned;
 pub mod checkpoint;
 mod error;
 pub mod eval;
+mod gain;
 pub mod gpu;
 pub mod keyframe;
 pub mod loss;

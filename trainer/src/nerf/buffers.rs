@@ -62,7 +62,7 @@ pub(crate) struct Occupancy {
     pub(crate) n_cells: u32,
 }
 
-/// Blocks of cells along an axis, as in `march.wgsl`.
+/// Blocks of cells along an axis, as in `cell_blocks.wgsl`.
 pub(crate) fn n_blocks(n_cells: u32) -> u32 {
     const MOST_BLOCKS: u32 = 16;
     n_cells.min(MOST_BLOCKS)

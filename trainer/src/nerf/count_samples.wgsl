@@ -9,6 +9,7 @@
 #import ray_batch
 #import march_params
 #import space
+#import cell_blocks
 #import march
 #import march_shares
 

@@ -30,6 +30,7 @@ macro_rules! layers {
             shared!("ray_batch"),
             shared!("hash_grid"),
             shared!("network_tile"),
+            shared!("network_layers"),
             shared!("image_terms"),
             shared!("sh"),
             shared!("number", concat!("number_", $numbers)),
@@ -61,6 +62,9 @@ const SHARED: &[Source] = &[
     shared!("image_terms"),
     shared!("term_step"),
     shared!("network_tile"),
+    shared!("network_layers"),
+    shared!("thickness_sum"),
+    shared!("cell_blocks"),
     shared!("ray_loss"),
     shared!("learn_rule"),
 ];

@@ -6,11 +6,10 @@
 
 #import folded
 #import visit
+#import cell_blocks
 
 @group(0) @binding(0) var<uniform> visit: Visit;
 @group(0) @binding(1) var<storage, read_write> occupied: array<u32>;
-
-const MOST_BLOCKS = 16u;
 
 fn any_in(block: vec3u, size: u32) -> bool {
     for (var z = block.z * size; z < (block.z + 1u) * size; z++) {
@@ -26,7 +25,7 @@ fn any_in(block: vec3u, size: u32) -> bool {
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
-    let size = max(visit.n_cells / MOST_BLOCKS, 1u);
+    let size = block_cells_of(visit.n_cells);
     let n_blocks = visit.n_cells / size;
     let word = folded(wg, n_wgs) * 64u + lane;
     if 32u * word >= n_blocks * n_blocks * n_blocks { return; }

@@ -5,6 +5,7 @@
 // writes    occupied (a bit a cell, before the blocks), steps ([1]: visits so far)
 
 #import folded
+#import thickness_sum
 
 @group(0) @binding(0) var<storage, read> thickness: array<f32>;
 @group(0) @binding(1) var<storage, read> thickness_sum: array<u32>;
@@ -13,7 +14,6 @@
 
 // A step through a cell that holds back less is left out, unless most hold back little: then half of their mean.
 const ENOUGH = 0.02;
-const MOST_SUM = 4294967040.0; // Of `sum_cells`: all cells hold back everything.
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {

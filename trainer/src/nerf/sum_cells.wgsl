@@ -2,14 +2,13 @@
 //
 // threads   one per 32 cells
 // reads     thickness
-// writes    thickness_sum (at most 1 a cell, in units that leave room for all: `mark_cells` knows them)
+// writes    thickness_sum (at most 1 a cell, in units of 1 / MOST_SUM of all)
 
 #import folded
+#import thickness_sum
 
 @group(0) @binding(0) var<storage, read> thickness: array<f32>;
 @group(0) @binding(1) var<storage, read_write> thickness_sum: array<atomic<u32>>;
-
-const MOST_SUM = 4294967040.0; // The largest f32 that is a u32.
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {

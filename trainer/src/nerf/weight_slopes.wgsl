@@ -10,6 +10,7 @@
 #import folded
 #import ray_batch
 #import network_tile
+#import network_layers
 
 @group(0) @binding(0) var<storage, read> batch: Batch;
 @group(0) @binding(1) var<storage, read> held: array<vec4f>;
@@ -19,28 +20,9 @@
 override SUM_LANES: u32;
 override CHUNK_TILES: u32;
 
-const N_LAYERS = 5u;
 const BANK = 576u;         // rows of slopes begin here: 64 strides
 
 var<workgroup> wg_rows: array<vec4f, 1152>;
-
-struct Layer {
-    n_in: u32,
-    n_out: u32,
-    held_row: u32,
-    v_row: u32,
-    first_weight: u32,     // in vec4
-}
-
-fn layer_of(ix: u32) -> Layer {
-    switch ix {
-        case 0u: { return Layer(N_FEATURES, N_HIDDEN, 0u, 0u, 0u); }
-        case 1u: { return Layer(N_HIDDEN, N_TOLD, hidden_0_row(), v_told_row(), told_weights()); }
-        case 2u: { return Layer(N_COLOR_IN, N_HIDDEN, color_input_row(), v_hidden_1_row(), hidden_1_weights()); }
-        case 3u: { return Layer(N_HIDDEN, N_HIDDEN, hidden_1_row(), v_hidden_2_row(), hidden_2_weights()); }
-        default: { return Layer(N_HIDDEN, N_COLORS, hidden_2_row(), v_color_row(), color_weights()); }
-    }
-}
 
 @compute @workgroup_size(SUM_LANES)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {

@@ -11,6 +11,7 @@
 #import folded
 #import ray_batch
 #import network_tile
+#import network_layers
 
 @group(0) @binding(0) var<storage, read> batch: Batch;
 @group(0) @binding(1) var<storage, read> held: array<Four>;
@@ -18,26 +19,6 @@
 @group(0) @binding(3) var<storage, read_write> partial_sums: array<f32>;
 
 override CHUNK_TILES: u32;
-
-const N_LAYERS = 5u;
-
-struct Layer {
-    n_in: u32,
-    n_out: u32,
-    held_row: u32,
-    v_row: u32,
-    first_weight: u32,     // in vec4
-}
-
-fn layer_of(ix: u32) -> Layer {
-    switch ix {
-        case 0u: { return Layer(N_FEATURES, N_HIDDEN, 0u, 0u, 0u); }
-        case 1u: { return Layer(N_HIDDEN, N_TOLD, hidden_0_row(), v_told_row(), told_weights()); }
-        case 2u: { return Layer(N_COLOR_IN, N_HIDDEN, color_input_row(), v_hidden_1_row(), hidden_1_weights()); }
-        case 3u: { return Layer(N_HIDDEN, N_HIDDEN, hidden_1_row(), v_hidden_2_row(), hidden_2_weights()); }
-        default: { return Layer(N_HIDDEN, N_COLORS, hidden_2_row(), v_color_row(), color_weights()); }
-    }
-}
 
 @compute @workgroup_size(256)
 fn main(

@@ -1,5 +1,5 @@
 // march: how a ray is walked through the parts of the scene that hold something. After `ray_batch`,
-// `march_params`, `space` and `occupied` of the kernel.
+// `march_params`, `space`, `cell_blocks` and `occupied` of the kernel.
 //
 // twin      nerf/reference/march.rs
 // source    occupancy: Mueller et al. 2022, appendix C; steps grow outside the inner cube as contraction shrinks them
@@ -7,8 +7,6 @@
 // Pieces are numbered along the ray; where a piece lies follows from its number, so that several threads may walk one ray.
 
 const FAR = 1e9;
-// Cells are told of one by one and, behind those, in blocks: so many along an axis.
-const MOST_BLOCKS = 16u;
 
 struct Path {
     enter: f32,            // where the inner cube begins along the ray, or what is looked at
@@ -74,7 +72,7 @@ struct Piece {
 
 // The first such piece from number `from_ix` on.
 fn next_piece(march: March, ray: Ray, path: Path, from_ix: u32, end_ix: u32) -> Piece {
-    let block_cells = max(march.n_cells / MOST_BLOCKS, 1u);
+    let block_cells = block_cells_of(march.n_cells);
     let n_blocks = march.n_cells / block_cells;
     let n_words = march.n_cells * march.n_cells * march.n_cells / 32u;
     var ix = from_ix;

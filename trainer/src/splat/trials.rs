@@ -7,6 +7,7 @@
 
 use super::camera_terms::TermSet;
 use super::trainer::State;
+use crate::gain::{Gain, LEAST_GAIN_DB};
 use crate::gpu::Buffer;
 use crate::{Keyframe, Part};
 use serde::{Deserialize, Serialize};
@@ -20,8 +21,7 @@ const SHARED_STEPS: u64 = 250;
 /// How often each image is looked at in a trial of terms of its own, and the most steps for it.
 const ROUNDS: u64 = 4;
 const MOST_STEPS: u64 = 1200;
-/// A gain below this is none, dB: of anything, and of twice the splats.
-const LEAST_GAIN_DB: f64 = 0.05;
+/// A gain of twice the splats below this is none, dB.
 const LEAST_GAIN_OF_DOUBLING_DB: f64 = 0.1;
 /// All that is left out may cost this much together, dB.
 const MOST_SPENT_DB: f64 = 0.15;
@@ -122,18 +122,16 @@ pub struct Trial {
 impl Trial {
     /// Judges paired scores, dB.
     pub(crate) fn of(candidate: Candidate, without_db: &[f64], with_db: &[f64]) -> Self {
-        let n = without_db.len().min(with_db.len());
         let gains: Vec<f64> = without_db.iter().zip(with_db).map(|(without, with)| with - without).collect();
-        let mean = gains.iter().sum::<f64>() / n.max(1) as f64;
-        let variance = gains.iter().map(|gain| (gain - mean).powi(2)).sum::<f64>() / n.saturating_sub(1).max(1) as f64;
-        let standard_error_db = (variance / n.max(1) as f64).sqrt();
-        let least = candidate.least_gain_db();
+        let gain = Gain::of(&gains);
+        let least_db = candidate.least_gain_db();
+        let Gain { mean_db: gain_db, standard_error_db, n_images } = gain;
         // In doubt nothing is added, and nothing is left out.
         let pays = match candidate.is_smaller() {
-            true => -mean + 0.5 * standard_error_db <= least,
-            false => mean > least.max(2.0 * standard_error_db),
+            true => -gain_db + 0.5 * standard_error_db <= least_db,
+            false => gain.pays(least_db),
         };
-        Self { candidate, gain_db: mean, standard_error_db, n_images: n, kept: n > 1 && pays }
+        Self { candidate, gain_db, standard_error_db, n_images, kept: n_images > 1 && pays }
     }
 
     /// The part of the model that was tried: what is added, or what would be left out.

@@ -7,6 +7,7 @@
 
 use super::NerfModel;
 use crate::checkpoint::Array;
+use crate::gain::{Gain, LEAST_GAIN_DB};
 use crate::nerf::extent::Extent;
 use crate::nerf::learner::Look;
 use crate::nerf::params::{CODE, TERM_STRIDE};
@@ -29,9 +30,6 @@ const LEAST_JUDGES: usize = 4;
 const JUDGING_BATCHES: u64 = 8;
 /// Seed of what they look at.
 const JUDGING_SEED: u64 = 0x6a75_6467;
-/// Less is not worth having, dB; nor is what two standard errors leave open.
-const LEAST_GAIN_DB: f64 = 0.05;
-const SURE: f64 = 2.0;
 
 /// The field at some step, in host memory.
 #[derive(Debug)]
@@ -380,16 +378,13 @@ fn bought(candidate: TermSet, with: &[f64], without: &[f64]) -> Part {
         .filter(|(with, without)| **with > 0.0 && **without > 0.0)
         .map(|(with, without)| 10.0 * (without / with).log10())
         .collect();
-    let n = gains.len().max(1) as f64;
-    let mean = gains.iter().sum::<f64>() / n;
-    let variance = gains.iter().map(|gain| (gain - mean).powi(2)).sum::<f64>() / f64::max(n - 1.0, 1.0);
-    let standard_error = (variance / n).sqrt();
+    let gain = Gain::of(&gains);
     Part {
         part: candidate.to_string(),
-        bought_db: mean,
-        standard_error_db: standard_error,
-        n_images: gains.len(),
-        kept: gains.len() >= LEAST_JUDGES && mean > f64::max(LEAST_GAIN_DB, SURE * standard_error),
+        bought_db: gain.mean_db,
+        standard_error_db: gain.standard_error_db,
+        n_images: gain.n_images,
+        kept: gain.n_images >= LEAST_JUDGES && gain.pays(LEAST_GAIN_DB),
     }
 }
 
