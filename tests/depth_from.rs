@@ -1,50 +1,17 @@
 //! `fieldrig train --depth-from`: images without depth get that of a saved model.
 
-use image::{ImageBuffer, Luma, RgbImage};
-use serde_json::{Value, json};
-use std::path::Path;
-use std::process::{Command, Output};
+mod wall;
 
-const N_PHOTOS: u32 = 10;
-const SIZE_PX: [u32; 2] = [48, 36];
+use serde_json::Value;
+use std::path::Path;
+use std::process::Output;
+use wall::fieldrig;
+
 const N_STEPS: &str = "24";
 /// What depth is worth after these few steps, dB.
 const LEAST_GAIN_DB: f64 = 2.0;
 /// Measured 0.2 mm: splats keep the depth that they were seeded by.
 const MOST_DEPTH_ERROR_M: f64 = 2e-3;
-
-/// A nerfstudio folder: a camera slides along a colorful wall, 1 m away from it and `up_m` above where others look.
-fn scene(folder: &Path, has_depth: bool, up_m: f64) {
-    std::fs::create_dir(folder).expect("room on the disk");
-    let ([w, h], focal_px) = (SIZE_PX, 45.0);
-    let mut frames = Vec::new();
-    for ix in 0..N_PHOTOS {
-        let x_m = 0.05 * f64::from(ix);
-        let color = |u: u32, v: u32| {
-            let (x, y) = (x_m + (f64::from(u) - 23.5) / focal_px, (f64::from(v) - 17.5) / focal_px);
-            #[expect(clippy::cast_possible_truncation, reason = "27 to 227")]
-            let wave = |phase: f64| (127.0 + 100.0 * (8.0 * x + phase).sin() * (7.0 * y + phase).cos()) as u8;
-            image::Rgb([wave(0.0), wave(1.0), wave(2.0)])
-        };
-        let [photo, depth] = ["", "depth_"].map(|kind| format!("{kind}{ix:02}.png"));
-        RgbImage::from_fn(w, h, color).save(folder.join(&photo)).expect("room on the disk");
-        let rows = [[1.0, 0.0, 0.0, x_m], [0.0, 1.0, 0.0, up_m], [0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 0.0, 1.0]];
-        let mut frame = json!({ "file_path": photo, "transform_matrix": rows });
-        if has_depth {
-            let metre = ImageBuffer::<Luma<u16>, _>::from_pixel(w, h, Luma([1000]));
-            metre.save(folder.join(&depth)).expect("room on the disk");
-            frame["depth_file_path"] = depth.into();
-        }
-        frames.push(frame);
-    }
-    let lens = json!({ "fl_x": focal_px, "fl_y": focal_px, "cx": 24.0, "cy": 18.0, "w": w, "h": h, "frames": frames });
-    std::fs::write(folder.join("transforms.json"), lens.to_string()).expect("room on the disk");
-}
-
-fn fieldrig(folder: &Path, args: &[&str]) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
-    command.current_dir(folder).env_remove("FIELDRIG_LPIPS_WEIGHTS").args(args).output().expect("fieldrig starts")
-}
 
 fn train(folder: &Path, args: &[&str]) -> Output {
     fieldrig(folder, &[&["train", "--json"], args].concat())
@@ -70,9 +37,9 @@ fn refused(folder: &Path, args: &[&str], code: i32, words: &str) {
 fn images_without_depth_are_learned_with_that_of_a_model_again_and_again_alike() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    scene(&folder.join("measured"), true, 0.0);
-    scene(&folder.join("seen"), false, 0.0);
-    scene(&folder.join("elsewhere"), false, 50.0);
+    wall::write(&folder.join("measured"), true, 0.0);
+    wall::write(&folder.join("seen"), false, 0.0);
+    wall::write(&folder.join("elsewhere"), false, 50.0);
     done(folder, &["measured", "--method", "tsdf", "--refine", "none", "--out", "field"]);
 
     let settings = ["--plan-steps", N_STEPS, "--seed", "3", "--max-splats", "2000", "--refine", "none"];

@@ -1,43 +1,13 @@
 //! Several methods that learn at once from the same images: each ends as it would alone, in a folder of its own.
 
-use image::{ImageBuffer, Luma, RgbImage};
+mod wall;
+
 use serde_json::{Value, json};
 use std::path::Path;
-use std::process::{Command, Output};
+use wall::fieldrig;
 
-const N_PHOTOS: u32 = 10;
-const SIZE_PX: [u32; 2] = [48, 36];
 /// Steps of each method; the distance field is done after the eight images it may see.
 const N_STEPS: &str = "24";
-
-/// A nerfstudio folder with depth: a camera slides along a colorful wall, 1 m away from it.
-fn scene(folder: &Path) {
-    std::fs::create_dir(folder).expect("room on the disk");
-    let ([w, h], focal_px) = (SIZE_PX, 45.0);
-    let mut frames = Vec::new();
-    for ix in 0..N_PHOTOS {
-        let x_m = 0.05 * f64::from(ix);
-        let color = |u: u32, v: u32| {
-            let (x, y) = (x_m + (f64::from(u) - 23.5) / focal_px, (f64::from(v) - 17.5) / focal_px);
-            #[expect(clippy::cast_possible_truncation, reason = "27 to 227")]
-            let wave = |phase: f64| (127.0 + 100.0 * (8.0 * x + phase).sin() * (7.0 * y + phase).cos()) as u8;
-            image::Rgb([wave(0.0), wave(1.0), wave(2.0)])
-        };
-        let [photo, depth] = ["", "depth_"].map(|kind| format!("{kind}{ix:02}.png"));
-        RgbImage::from_fn(w, h, color).save(folder.join(&photo)).expect("room on the disk");
-        let metre = ImageBuffer::<Luma<u16>, _>::from_pixel(w, h, Luma([1000]));
-        metre.save(folder.join(&depth)).expect("room on the disk");
-        let rows = [[1.0, 0.0, 0.0, x_m], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 0.0, 1.0]];
-        frames.push(json!({ "file_path": photo, "depth_file_path": depth, "transform_matrix": rows }));
-    }
-    let lens = json!({ "fl_x": focal_px, "fl_y": focal_px, "cx": 24.0, "cy": 18.0, "w": w, "h": h, "frames": frames });
-    std::fs::write(folder.join("transforms.json"), lens.to_string()).expect("room on the disk");
-}
-
-fn fieldrig(folder: &Path, args: &[&str]) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
-    command.current_dir(folder).env_remove("FIELDRIG_LPIPS_WEIGHTS").args(args).output().expect("fieldrig starts")
-}
 
 /// The JSON lines of a training that succeeded.
 fn trained(folder: &Path, args: &[&str]) -> Vec<Value> {
@@ -64,7 +34,7 @@ fn refused(folder: &Path, args: &[&str], words: &[&str]) {
 fn each_of_several_methods_ends_with_the_bits_that_it_has_alone() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    scene(&folder.join("data"));
+    wall::write(&folder.join("data"), true, 0.0);
     let common = ["--steps", N_STEPS, "--seed", "3", "--refine", "image-poses"];
     let all = ["--method", "tsdf,splat,nerf", "--max-splats", "500", "--out", "all"];
     let together = trained(folder, &[&common[..], &all].concat());
@@ -137,7 +107,7 @@ fn several_methods_share_the_time_and_tell_their_scores_by_one_clock() {
     const MOST_UNEVEN: f64 = 3.0;
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    scene(&folder.join("data"));
+    wall::write(&folder.join("data"), true, 0.0);
     let args = ["--seconds", "2.1", "--max-splats", "500", "--method", "splat,nerf", "--out", "both"];
     let told = trained(folder, &args);
     let evals = |method: &str| -> Vec<&Value> {
