@@ -39,6 +39,11 @@ pub(crate) struct DataArgs {
 }
 
 impl DataArgs {
+    /// What is held out for testing, where a flag says.
+    pub(crate) fn holdout(&self) -> Result<Option<Holdout>, BadArgument> {
+        self.holdout.as_deref().map(Holdout::from_argument).transpose()
+    }
+
     /// What is given of the flags that keyframes are made by: values by names, files by their whole path.
     pub(crate) fn flags(&self) -> BTreeMap<String, String> {
         let whole = |file: &Path| file.canonicalize().unwrap_or_else(|_| file.to_owned()).display().to_string();
@@ -142,7 +147,7 @@ impl Data {
         quiet: bool,
     ) -> anyhow::Result<Self> {
         let list = args.keyframes.as_deref().map(KeyframeList::load).transpose()?;
-        let holdout = args.holdout.as_deref().map(Holdout::from_argument).transpose()?;
+        let holdout = args.holdout()?;
         Self::selected(
             path,
             Selection { list, holdout, scale: args.scale, rig: args.rig.clone(), as_told: false },

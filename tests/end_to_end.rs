@@ -450,6 +450,7 @@ fn a_replay_without_training_keyframes_ends_with_a_reason() {
         let told = String::from_utf8_lossy(&output.stderr);
         assert_eq!(output.status.code(), Some(4), "{told}");
         assert!(told.contains(reason), "{told}");
+        assert!(!folder.join(format!("out-{rig}")).exists(), "what is refused leaves nothing behind");
     }
 }
 

@@ -46,8 +46,10 @@ struct Named {
 /// Draws and scores every test image.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
+    // All before the data, which take long to read.
+    args.images.holdout()?;
     data::expect(&args.data)?;
-    let mut model = method::load(super::open_gpu()?, &args.model)?; // Before the data, which take long to read.
+    let mut model = method::load(super::open_gpu()?, &args.model)?;
     let overrides = as_trained(&args.model);
     let data = Data::load(&args.data, &args.images, Purpose::Scoring, &overrides, args.json)?;
     let tests = data.of_split(Split::Test);

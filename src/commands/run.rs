@@ -48,7 +48,8 @@ pub(crate) struct Args {
     /// Stop after S seconds, counted from the first image [default: run until Ctrl-C]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
-    /// Stop after N optimiser steps (in lockstep one seed gives one result then), or when the devices ended and there is nothing left to fuse
+    /// Stop after N optimiser steps, or when the devices ended and there is nothing left to fuse; in lockstep one seed gives one
+    /// result then
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
     /// With a lockstep simulation or a recording only: steps between two keyframes [default: 10]

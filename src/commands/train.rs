@@ -129,6 +129,9 @@ fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
     }
     let (mut images, mut overrides) = (args.images.clone(), args.training.overrides());
     let mut realign = args.training.realign();
+    if let Some(replay) = &replay {
+        images.scale = Some(replay.decisions.settings.scale);
+    }
     if let (Some(checkpoint), Some(whose)) = (&checkpoint, &whose) {
         depth_from::check_same(whose, checkpoint.depth_from.as_deref(), depth_sum)?;
         if replay.is_none() {
@@ -183,7 +186,7 @@ fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
             method: kind.name(),
             data: Some(&args.data),
             adapter: gpu.describe(),
-            scale: scale(&images, &data, replay.as_ref()),
+            scale: data.rig.as_ref().map(|rig| rig.train.scale).or(images.scale).unwrap_or(1.0),
             depth_from: of_data.depth_from.clone(),
             from_step,
             options,
@@ -247,13 +250,6 @@ fn refuse_over(limits: Limits, checkpoint: &Checkpoint, whose: &str) -> Result<(
         ))),
         None => Ok(()),
     }
-}
-
-/// Share of their size that images were shrunk to.
-fn scale(images: &DataArgs, data: &Data, replay: Option<&Replay>) -> f64 {
-    let of_rig = data.rig.as_ref().map(|rig| rig.train.scale);
-    let of_log = replay.map(|replay| replay.decisions.settings.scale);
-    of_rig.or(of_log).or(images.scale).unwrap_or(1.0)
 }
 
 /// Writes the rig file, and says where nothing changed in it.
