@@ -67,7 +67,9 @@ fn shared_key(block: Place, edge: u32) -> Option<(Place, u32)> {
 ///
 /// Source: Cigolle et al. 2014, "A survey of efficient representations for independent unit vectors", section 3.
 pub(in crate::tsdf) fn unit_of(octahedral: u32) -> [f32; 3] {
-    let [low, high] = [octahedral, octahedral >> 16].map(|half| f64::from(half as u16 as i16) / 32767.0);
+    let bytes = octahedral.to_le_bytes();
+    let [low, high] =
+        [[bytes[0], bytes[1]], [bytes[2], bytes[3]]].map(|half| f64::from(i16::from_le_bytes(half)) / 32767.0);
     let up = 1.0 - low.abs() - high.abs();
     let [x, y] =
         if up < 0.0 { [(1.0 - high.abs()) * low.signum(), (1.0 - low.abs()) * high.signum()] } else { [low, high] };
