@@ -129,6 +129,14 @@ pub enum Error {
         /// Bytes needed.
         expected_bytes: usize,
     },
+    /// A device tells colours that are not decoded.
+    #[error("V4L2 colorspace {colorspace} with Y'CbCr encoding {ycbcr_enc}: only BT.601 and BT.709 are decoded")]
+    YuvColors {
+        /// `enum v4l2_colorspace`.
+        colorspace: u32,
+        /// `enum v4l2_ycbcr_encoding`.
+        ycbcr_enc: u32,
+    },
     /// Colour was asked of a depth image or depth of a colour image.
     #[error("camera {camera:?}: the image at {} ns holds no {wanted}", stamp.0)]
     WrongKind {

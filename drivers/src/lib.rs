@@ -1,18 +1,22 @@
 //! Devices, recordings and datasets behind a few traits; what comes out is stamped samples.
 
+pub mod align;
 pub mod clock;
 pub mod dataset;
 mod decode;
 mod error;
+pub mod jpeg;
 mod live;
 pub mod recording;
 mod sample;
 pub mod udp;
 pub mod wire;
+mod yuv;
 
 pub use error::{Error, Kept};
 pub use live::{Devices, Live};
 pub use sample::{BasePose, Image, PixelFormat, RangePoint, RangeScan, Sample, TruthImage};
+pub use yuv::{V4l2Colors, YuvColors, YuvLayout, YuvMatrix, YuvRange};
 
 use kinematics::{Intrinsics, JointState};
 use std::time::Duration;
