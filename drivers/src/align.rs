@@ -144,7 +144,6 @@ impl DepthAlignment {
         let [tx, ty, tz] = self.depth_in_color;
         let ([fx, fy], [cx, cy]) = (self.color.focal_px, self.color.principal_px);
         let [width, height] = self.color.size_px.map(|side| side as f32);
-        #[expect(clippy::needless_range_loop, reason = "six arrays go in step")]
         for ix in 0..n {
             let depth_m = f32::from(counts[ix]) * metres_per_count;
             let z = depth_m * zs[ix] + tz;
@@ -289,7 +288,7 @@ mod tests {
     /// The twin: the same squares in f64 with the lenses of `kinematics`.
     fn twin(depth: &Intrinsics, color: &Intrinsics, color_from_depth: &Transform, counts: &[u16]) -> Vec<u16> {
         let [width, height] = color.size_px.map(i64::from);
-        let mut aligned = vec![0; (width * height).cast_unsigned() as usize];
+        let mut aligned = vec![0; color.size_px.map(|side| side as usize).iter().product()];
         for (ix, &count) in counts.iter().enumerate().filter(|(_, count)| **count > 0 && **count < u16::MAX) {
             let column = (ix % depth.size_px[0] as usize) as f64;
             let row = (ix / depth.size_px[0] as usize) as f64;
@@ -307,7 +306,7 @@ mod tests {
             };
             for y in top.max(0)..=bottom.min(height - 1) {
                 for x in left.max(0)..=right.min(width - 1) {
-                    let nearest: &mut u16 = &mut aligned[(y * width + x).cast_unsigned() as usize];
+                    let nearest: &mut u16 = &mut aligned[usize::try_from(y * width + x).expect("inside the image")];
                     *nearest = if *nearest == 0 { count } else { count.min(*nearest) };
                 }
             }

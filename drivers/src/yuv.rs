@@ -194,7 +194,6 @@ impl Fixed {
     }
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "clamped to a byte")]
 #[inline(always)]
 fn to_byte(scaled: i32) -> u8 {
     (scaled >> SHIFT).clamp(0, 255) as u8
