@@ -35,6 +35,22 @@ pub enum Error {
         /// How long the call waited.
         waited: Duration,
     },
+    /// A V4L2 camera cannot be opened, or was lost for good.
+    #[error("camera {camera:?}: {problem}")]
+    V4l2 {
+        /// Name in the rig file.
+        camera: String,
+        /// What is wrong.
+        problem: Box<crate::v4l2::Problem>,
+    },
+    /// A camera was lost and is looked for; asking again may find it.
+    #[error("camera {camera:?}: lost for {waited:?}, looking for it")]
+    Reconnecting {
+        /// Name in the rig file.
+        camera: String,
+        /// Since when.
+        waited: Duration,
+    },
     /// An arm stayed silent.
     #[error("arm: no joint readings within {waited:?}")]
     NoJoints {

@@ -10,6 +10,7 @@ mod live;
 pub mod recording;
 mod sample;
 pub mod udp;
+pub mod v4l2;
 pub mod wire;
 mod yuv;
 
@@ -29,7 +30,8 @@ pub trait Camera: Send {
     fn intrinsics(&self) -> &Intrinsics;
     /// Waits for the next image this call has not returned yet, in stamp order; colour and depth are told apart by format.
     ///
-    /// A slow caller loses the oldest images; the loss is counted in [`Image::n_skipped`].
+    /// A slow caller loses the oldest images; the loss is counted in [`Image::n_skipped`]. A camera that was unplugged and is
+    /// looked for says [`Error::Reconnecting`], for a bounded time.
     fn next_image(&mut self, timeout: Duration) -> Result<Image, Error>;
 }
 

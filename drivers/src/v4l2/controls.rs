@@ -1,0 +1,333 @@
+//! Exposure, gain, white balance and brightness: what is set for a rig file, in which order, and what is read back.
+//!
+//! Source: Linux `v4l2-controls.h` and its documentation of user and camera controls; numbers are the kernel's.
+
+use super::Problem;
+use super::abi::{self, QueryControl};
+use super::device::Device;
+use std::io;
+
+/// Exposure counts of 100 us.
+const MICROS_PER_COUNT: f64 = 100.0;
+/// Cameras round an exposure to the rows of their sensor: so much may it be off when read back.
+const EXPOSURE_OFF_FRAC: f64 = 0.1;
+
+/// A control by the kernel's number.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u32)]
+enum Id {
+    Brightness = 0x0098_0900,
+    AutoWhiteBalance = 0x0098_090c,
+    AutoGain = 0x0098_0912,
+    Gain = 0x0098_0913,
+    WhiteBalanceTemperature = 0x0098_091a,
+    ExposureAuto = 0x009a_0901,
+    ExposureAbsolute = 0x009a_0902,
+    /// `exposure_dynamic_framerate`: automatic exposure may lower the rate.
+    ExposureAutoPriority = 0x009a_0903,
+    AnalogueGain = 0x009e_0903,
+}
+
+/// Entries of the menu [`Id::ExposureAuto`].
+const EXPOSURE_FULLY_AUTOMATIC: i32 = 0;
+const EXPOSURE_MANUAL: i32 = 1;
+const EXPOSURE_SHUTTER_PRIORITY: i32 = 2;
+const EXPOSURE_APERTURE_PRIORITY: i32 = 3;
+
+/// What the rig file says of the picture; what it leaves open is automatic where the camera can do that, else left as it is.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Settings {
+    /// Exposure time, microseconds; `None` lets the camera choose at the rate it was asked for.
+    pub exposure_micros: Option<f64>,
+    /// Gain, counts of the camera.
+    pub gain: Option<i32>,
+    /// White balance, kelvin.
+    pub white_balance_kelvin: Option<i32>,
+    /// Brightness, counts of the camera.
+    pub brightness: Option<i32>,
+}
+
+/// One control to set.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Step {
+    control: &'static str,
+    id: Id,
+    value: i32,
+    /// How far off it may read back.
+    slack: i32,
+}
+
+/// What the camera is set to, as it told itself.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Applied {
+    /// Exposure time where it is fixed and told, seconds.
+    pub(super) exposure_secs: Option<f64>,
+    /// Whether the exposure is automatic and can be asked for.
+    pub(super) tells_exposure: bool,
+    /// Names and values, for people.
+    pub(super) read_back: Vec<(&'static str, i32)>,
+}
+
+/// What a camera has, as the plan needs it.
+trait Controls {
+    fn find(&self, id: Id) -> Option<QueryControl>;
+    fn menu(&self, id: Id) -> Vec<i32>;
+}
+
+impl Controls for Device {
+    fn find(&self, id: Id) -> Option<QueryControl> {
+        self.control(id as u32)
+    }
+
+    fn menu(&self, id: Id) -> Vec<i32> {
+        let Some(control) = self.control(id as u32) else { return Vec::new() };
+        match control.kind {
+            abi::CONTROL_MENU => Self::menu(self, id as u32, control.minimum..=control.maximum.min(64)),
+            _ => (control.minimum..=control.maximum.min(64)).collect(),
+        }
+    }
+}
+
+/// Sets a device, reads everything back, and compares.
+pub(super) fn apply(settings: &Settings, device: &Device) -> Result<Applied, Problem> {
+    let steps = plan(settings, device)?;
+    for step in &steps {
+        device.set_control(step.id as u32, step.value).map_err(|error| refused(step.control, error))?;
+    }
+    check(settings, device, &steps)
+}
+
+/// Compares again once images come, for some cameras forget their settings when a stream begins; sets them once more if so.
+pub(super) fn confirm(settings: &Settings, device: &Device) -> Result<Applied, Problem> {
+    match check(settings, device, &plan(settings, device)?) {
+        Err(Problem::ReadBack { .. }) => apply(settings, device),
+        other => other,
+    }
+}
+
+/// Reads back what was set, and compares.
+fn check(settings: &Settings, device: &Device, steps: &[Step]) -> Result<Applied, Problem> {
+    let mut applied = Applied::default();
+    for step in steps {
+        let got = device.control_value(step.id as u32).map_err(|error| refused(step.control, error))?;
+        if got.abs_diff(step.value) > step.slack.unsigned_abs() {
+            return Err(Problem::ReadBack { control: step.control, wanted: step.value, got });
+        }
+        if step.id == Id::ExposureAbsolute {
+            applied.exposure_secs = Some(secs_of_counts(got));
+        }
+        applied.read_back.push((step.control, got));
+    }
+    if settings.exposure_micros.is_none() {
+        applied.tells_exposure = exposure_secs(device).is_some();
+    } else if applied.exposure_secs.is_none() {
+        // It cannot be set: then the rig file knows it.
+        applied.exposure_secs = settings.exposure_micros.map(|micros| micros * 1e-6);
+    }
+    Ok(applied)
+}
+
+/// The exposure time that a camera tells, seconds.
+pub(super) fn exposure_secs(device: &Device) -> Option<f64> {
+    let counts = device.control_value(Id::ExposureAbsolute as u32).ok()?;
+    (counts > 0).then(|| secs_of_counts(counts))
+}
+
+fn secs_of_counts(counts: i32) -> f64 {
+    f64::from(counts) * MICROS_PER_COUNT * 1e-6
+}
+
+fn refused(control: &'static str, error: rustix::io::Errno) -> Problem {
+    match error {
+        rustix::io::Errno::NODEV => Problem::Unplugged { source: error.into() },
+        _ => Problem::Refused { what: control, source: io::Error::from(error) },
+    }
+}
+
+/// What is set, in order: what is automatic first, for a value that automation holds cannot be set.
+fn plan(settings: &Settings, camera: &impl Controls) -> Result<Vec<Step>, Problem> {
+    let mut steps = Vec::new();
+    exposure(settings.exposure_micros, camera, &mut steps)?;
+    let gain_id = [Id::Gain, Id::AnalogueGain].into_iter().find(|id| camera.find(*id).is_some());
+    let gain = Lock { auto: ("automatic gain", Id::AutoGain), fixed: ("v4l2.gain", gain_id.unwrap_or(Id::Gain)) };
+    gain.plan(settings.gain, camera, &mut steps)?;
+    let balance = Lock {
+        auto: ("automatic white balance", Id::AutoWhiteBalance),
+        fixed: ("v4l2.white_balance_kelvin", Id::WhiteBalanceTemperature),
+    };
+    balance.plan(settings.white_balance_kelvin, camera, &mut steps)?;
+    if let Some(value) = settings.brightness {
+        steps.push(fixed("v4l2.brightness", Id::Brightness, value, camera)?);
+    }
+    Ok(steps)
+}
+
+/// A value that a camera may choose itself.
+struct Lock {
+    auto: (&'static str, Id),
+    fixed: (&'static str, Id),
+}
+
+impl Lock {
+    fn plan(&self, value: Option<i32>, camera: &impl Controls, steps: &mut Vec<Step>) -> Result<(), Problem> {
+        let (control, id) = self.auto;
+        if camera.find(id).is_some() {
+            steps.push(Step { control, id, value: i32::from(value.is_none()), slack: 0 });
+        }
+        if let Some(value) = value {
+            steps.push(fixed(self.fixed.0, self.fixed.1, value, camera)?);
+        }
+        Ok(())
+    }
+}
+
+/// A value that has to be within the range and on the steps of its control.
+fn fixed(control: &'static str, id: Id, value: i32, camera: &impl Controls) -> Result<Step, Problem> {
+    let known = camera.find(id).ok_or(Problem::NoControl { control })?;
+    let step = known.step.max(1);
+    let is_known = (known.minimum..=known.maximum).contains(&value)
+        && (i64::from(value) - i64::from(known.minimum)) % i64::from(step) == 0;
+    if !is_known {
+        return Err(Problem::ControlRange {
+            control,
+            wanted: value.into(),
+            least: known.minimum.into(),
+            most: known.maximum.into(),
+            step: step.into(),
+        });
+    }
+    Ok(Step { control, id, value, slack: 0 })
+}
+
+/// Exposure: the mode, that automation keeps the rate, and the time where it is fixed.
+fn exposure(micros: Option<f64>, camera: &impl Controls, steps: &mut Vec<Step>) -> Result<(), Problem> {
+    let entries = camera.menu(Id::ExposureAuto);
+    let candidates = match micros {
+        // Cameras without an iris call "automatic" what photographers call aperture priority.
+        None => [EXPOSURE_APERTURE_PRIORITY, EXPOSURE_FULLY_AUTOMATIC],
+        Some(_) => [EXPOSURE_MANUAL, EXPOSURE_SHUTTER_PRIORITY],
+    };
+    if let Some(value) = candidates.into_iter().find(|entry| entries.contains(entry)) {
+        steps.push(Step { control: "exposure mode", id: Id::ExposureAuto, value, slack: 0 });
+    }
+    if camera.find(Id::ExposureAutoPriority).is_some() {
+        let control = "exposure_dynamic_framerate";
+        steps.push(Step { control, id: Id::ExposureAutoPriority, value: 0, slack: 0 });
+    }
+    let Some(micros) = micros else { return Ok(()) };
+    let Some(known) = camera.find(Id::ExposureAbsolute) else { return Ok(()) };
+    let step = f64::from(known.step.max(1));
+    let nearest =
+        ((micros / MICROS_PER_COUNT - f64::from(known.minimum)) / step).round() * step + f64::from(known.minimum);
+    // A time shorter than half a step of the shortest is not what was asked for.
+    let counts = (f64::from(known.minimum)..=f64::from(known.maximum)).contains(&nearest).then_some(nearest);
+    #[expect(clippy::cast_possible_truncation, reason = "within the range of the control, which is 32 bits wide")]
+    let value = counts.map(|counts| counts as i32).ok_or(Problem::ControlRange {
+        control: "exposure_micros",
+        wanted: micros,
+        least: f64::from(known.minimum) * MICROS_PER_COUNT,
+        most: f64::from(known.maximum) * MICROS_PER_COUNT,
+        step: step * MICROS_PER_COUNT,
+    })?;
+    #[expect(clippy::cast_possible_truncation, reason = "a tenth of 32 bits")]
+    let slack = (f64::from(value) * EXPOSURE_OFF_FRAC) as i32;
+    steps.push(Step { control: "exposure_micros", id: Id::ExposureAbsolute, value, slack: slack.max(known.step) });
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A camera by a table of its controls: number, least, most, step.
+    struct Table {
+        controls: &'static [(Id, i32, i32, i32)],
+        exposure_modes: &'static [i32],
+    }
+
+    impl Controls for Table {
+        fn find(&self, id: Id) -> Option<QueryControl> {
+            let (_, minimum, maximum, step) = *self.controls.iter().find(|control| control.0 == id)?;
+            Some(QueryControl { id: id as u32, minimum, maximum, step, ..Default::default() })
+        }
+
+        fn menu(&self, _: Id) -> Vec<i32> {
+            self.exposure_modes.to_vec()
+        }
+    }
+
+    /// Logitech C920 as `v4l2-ctl -L` prints it (kernel 5.15, firmware 0.0.15).
+    const C920: Table = Table {
+        controls: &[
+            (Id::Brightness, 0, 255, 1),
+            (Id::AutoWhiteBalance, 0, 1, 1),
+            (Id::Gain, 0, 255, 1),
+            (Id::WhiteBalanceTemperature, 2000, 6500, 1),
+            (Id::ExposureAuto, 0, 3, 1),
+            (Id::ExposureAbsolute, 3, 2047, 1),
+            (Id::ExposureAutoPriority, 0, 1, 1),
+        ],
+        exposure_modes: &[1, 3],
+    };
+
+    /// The test driver vivid.
+    const VIVID: Table = Table {
+        controls: &[(Id::Brightness, 0, 255, 1), (Id::AutoGain, 0, 1, 1), (Id::Gain, 0, 255, 1)],
+        exposure_modes: &[],
+    };
+
+    fn planned(settings: &Settings, camera: &Table) -> Vec<(Id, i32)> {
+        plan(settings, camera).expect("it can").iter().map(|step| (step.id, step.value)).collect()
+    }
+
+    #[test]
+    fn what_the_rig_file_leaves_open_is_automatic_and_keeps_the_rate() {
+        let automatic = planned(&Settings::default(), &C920);
+        let wanted = [(Id::ExposureAuto, 3), (Id::ExposureAutoPriority, 0), (Id::AutoWhiteBalance, 1)];
+        assert_eq!(automatic, wanted);
+        assert_eq!(planned(&Settings::default(), &VIVID), [(Id::AutoGain, 1)]);
+    }
+
+    #[test]
+    fn what_it_fixes_is_set_after_its_automation_is_off() {
+        let settings = Settings {
+            exposure_micros: Some(4040.0),
+            gain: Some(12),
+            white_balance_kelvin: Some(4600),
+            brightness: Some(100),
+        };
+        let wanted = [
+            (Id::ExposureAuto, 1),
+            (Id::ExposureAutoPriority, 0),
+            (Id::ExposureAbsolute, 40),
+            (Id::Gain, 12),
+            (Id::AutoWhiteBalance, 0),
+            (Id::WhiteBalanceTemperature, 4600),
+            (Id::Brightness, 100),
+        ];
+        assert_eq!(planned(&settings, &C920), wanted);
+        let gain = Settings { gain: Some(12), ..Settings::default() };
+        assert_eq!(planned(&gain, &VIVID), [(Id::AutoGain, 0), (Id::Gain, 12)]);
+    }
+
+    #[test]
+    fn what_a_camera_cannot_do_is_told_with_what_it_can() {
+        let refuse = |settings: &Settings, camera: &Table| plan(settings, camera).expect_err("it cannot").to_string();
+        let dark = Settings { exposure_micros: Some(100.0), ..Settings::default() };
+        assert_eq!(refuse(&dark, &C920), "exposure_micros is 100, it takes 300 to 204700 in steps of 100");
+        let loud = Settings { gain: Some(256), ..Settings::default() };
+        assert_eq!(refuse(&loud, &C920), "v4l2.gain is 256, it takes 0 to 255 in steps of 1");
+        let warm = Settings { white_balance_kelvin: Some(4600), ..Settings::default() };
+        assert_eq!(refuse(&warm, &VIVID), "it has no control for v4l2.white_balance_kelvin: leave the key out");
+        const COARSE: Table = Table { controls: &[(Id::Gain, 0, 100, 10)], exposure_modes: &[] };
+        let off = Settings { gain: Some(15), ..Settings::default() };
+        assert!(refuse(&off, &COARSE).ends_with("it takes 0 to 100 in steps of 10"));
+    }
+
+    #[test]
+    fn a_camera_without_exposure_control_is_not_refused() {
+        // The key then says what is known of it, as docs/rig.md tells.
+        let known = Settings { exposure_micros: Some(4000.0), ..Settings::default() };
+        assert_eq!(planned(&known, &VIVID), [(Id::AutoGain, 1)]);
+    }
+}

@@ -1,0 +1,309 @@
+//! Inside the virtual kernel: the V4L2 driver against vivid. Two devices: `vivid-000` is a webcam, `vivid-001` an HDMI grabber.
+//!
+//! vivid has no exposure control and no MJPEG: those are tested with tables and files beside their code.
+
+use drivers::v4l2::{self, Config, Counts, Delivery, Settings, V4l2Camera, V4l2Format};
+use drivers::{Camera, Error, Image};
+use kinematics::{Intrinsics, Lens};
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+const WEBCAM: &str = "platform:vivid-000";
+const GRABBER: &str = "platform:vivid-001";
+/// Controls by which vivid injects faults (`vivid-ctrls.c`): percent of the images that it drops; a pulled cable.
+const DROP_PERCENT: u32 = 0x00f0_f040;
+const DISCONNECT: u32 = 0x00f0_f041;
+/// Gain and brightness by the kernel's numbers, and values that are not the defaults.
+const GAIN: u32 = 0x0098_0913;
+const BRIGHTNESS: u32 = 0x0098_0900;
+const SETTINGS: Settings =
+    Settings { exposure_micros: None, gain: Some(77), white_balance_kelvin: None, brightness: Some(99) };
+
+fn config(device: &str, size_px: [u32; 2], rate_hz: f64) -> Config {
+    Config {
+        name: "front".into(),
+        device: device.into(),
+        format: None,
+        intrinsics: Intrinsics {
+            size_px,
+            focal_px: [500.0; 2],
+            principal_px: size_px.map(|side| f64::from(side) / 2.0),
+            lens: Lens::Pinhole,
+            rectified: true,
+        },
+        rate_hz,
+        metres_per_count: None,
+        settings: Settings::default(),
+        delivery: Delivery::Every,
+        reconnect_for: Duration::from_secs(5),
+    }
+}
+
+/// The node of a device now; it may have another number after a replug.
+fn node(bus: &str) -> PathBuf {
+    v4l2::cameras().into_iter().find(|found| found.bus == bus).expect("vivid is there").node
+}
+
+/// What came in a stretch of time.
+struct Seen {
+    images: Vec<Image>,
+    elapsed: Duration,
+}
+
+impl Seen {
+    /// All images of `seconds`; only the first keeps its pixels.
+    fn during(camera: &mut V4l2Camera, seconds: f64) -> Self {
+        let began = Instant::now();
+        let mut images = Vec::new();
+        while began.elapsed().as_secs_f64() < seconds {
+            let mut image = camera.next_image(Duration::from_secs(2)).expect("vivid streams");
+            if !images.is_empty() {
+                image.data = [].into();
+            }
+            images.push(image);
+        }
+        Self { images, elapsed: began.elapsed() }
+    }
+
+    /// Delivered and lost after the first image, and how many the stamps say there were: two counts that share nothing.
+    fn counts(&self, rate_hz: f64) -> (u64, u64, u64) {
+        let delivered = self.images.len() as u64 - 1;
+        let lost = self.images[1..].iter().map(|image| image.n_skipped).sum();
+        let secs = (self.images.last().expect("images").stamp.0 - self.images[0].stamp.0) as f64 * 1e-9;
+        (delivered, lost, (secs * rate_hz).round() as u64)
+    }
+
+    fn report(&self, what: &str, rate_hz: f64) -> (u64, u64) {
+        let (delivered, lost, by_stamps) = self.counts(rate_hz);
+        println!("{what}: {delivered} images and {lost} lost ones in {:.2?}; {by_stamps} by their stamps", self.elapsed);
+        assert_eq!(delivered + lost, by_stamps, "{what}: a lost image was not counted, or one too many was");
+        let in_order = self.images.windows(2).all(|pair| pair[0].stamp < pair[1].stamp);
+        assert!(in_order, "{what}: stamps go back");
+        (delivered, lost)
+    }
+}
+
+#[test]
+#[ignore = "runs in the virtual kernel"]
+fn every_lost_image_is_counted_in_ten_seconds() {
+    for (device, size_px, rate_hz) in
+        [(WEBCAM, [640, 360], 25.0), (WEBCAM, [1920, 1080], 5.0), (GRABBER, [1920, 1080], 60.0)]
+    {
+        let mut camera = V4l2Camera::open(config(device, size_px, rate_hz)).expect("vivid opens");
+        let what = format!("{device} {}x{} at {rate_hz} Hz", size_px[0], size_px[1]);
+        let seen = Seen::during(&mut camera, 10.0);
+        let (delivered, lost) = seen.report(&what, rate_hz);
+        let Counts { n_images, n_skipped, n_damaged, n_reconnections } = camera.counts();
+        assert_eq!((n_images, n_damaged, n_reconnections), (delivered + 1, 0, 0));
+        assert_eq!(n_skipped, lost + seen.images[0].n_skipped);
+        let first = &seen.images[0];
+        assert_eq!(first.decode_rgb().expect("raw pixels").len(), size_px.map(|side| side as usize).iter().product::<usize>() * 3);
+    }
+}
+
+#[test]
+#[ignore = "runs in the virtual kernel"]
+fn injected_drops_are_counted_exactly() {
+    let rate_hz = 25.0;
+    let mut camera = V4l2Camera::open(config(WEBCAM, [640, 360], rate_hz)).expect("vivid opens");
+    v4l2::set_control(&node(WEBCAM), DROP_PERCENT, 30).expect("vivid injects faults");
+    let (delivered, lost) = Seen::during(&mut camera, 12.0).report("30 % dropped", rate_hz);
+    v4l2::set_control(&node(WEBCAM), DROP_PERCENT, 0).expect("vivid injects faults");
+    let share = lost as f64 / (delivered + lost) as f64;
+    // 300 throws of a coin of 30 %: four standard deviations.
+    assert!((0.19..0.41).contains(&share), "a share of {share:.2} was lost");
+}
+
+/// Waits for an image after a fault; how long it took.
+fn back_after(camera: &mut V4l2Camera, began: Instant) -> (Image, Duration) {
+    loop {
+        match camera.next_image(Duration::from_millis(100)) {
+            Ok(image) => return (image, began.elapsed()),
+            Err(Error::NoImage { .. } | Error::Reconnecting { .. }) => assert!(began.elapsed() < Duration::from_secs(5)),
+            Err(other) => panic!("{other}"),
+        }
+    }
+}
+
+fn drive(action: &str) {
+    fs::write(Path::new("/sys/bus/platform/drivers/vivid").join(action), "vivid.0").expect("vivid can be (un)bound");
+}
+
+#[test]
+#[ignore = "runs in the virtual kernel"]
+fn a_pulled_cable_is_survived_with_all_settings() {
+    let rate_hz = 25.0;
+    let mut camera =
+        V4l2Camera::open(Config { settings: SETTINGS, ..config(WEBCAM, [640, 360], rate_hz) }).expect("vivid opens");
+    let set = |camera: &V4l2Camera| {
+        let told: BTreeMap<_, _> = camera.read_back().iter().copied().collect();
+        assert_eq!((told["v4l2.gain"], told["v4l2.brightness"]), (77, 99), "read back by the driver");
+        let node = node(WEBCAM);
+        assert_eq!(v4l2::control(&node, GAIN).expect("vivid has gain"), 77);
+        assert_eq!(v4l2::control(&node, BRIGHTNESS).expect("vivid has brightness"), 99);
+    };
+    Seen::during(&mut camera, 0.5);
+    set(&camera);
+
+    for n_before in 0..3 {
+        v4l2::set_control(&node(WEBCAM), DISCONNECT, 1).expect("vivid injects faults");
+        // Pictures that were taken before may still come.
+        let began = Instant::now();
+        let image = loop {
+            let (image, took) = back_after(&mut camera, began);
+            if camera.counts().n_reconnections > n_before {
+                println!("disconnected: images again after {took:.0?}, {} counted as lost", image.n_skipped);
+                assert!(took < Duration::from_secs(1), "{took:?}");
+                break image;
+            }
+        };
+        assert!(image.n_skipped <= 25, "{}", image.n_skipped);
+        set(&camera);
+    }
+
+    drive("unbind");
+    let pulled = Instant::now();
+    while !matches!(camera.next_image(Duration::from_millis(50)), Err(Error::Reconnecting { .. })) {
+        assert!(pulled.elapsed() < Duration::from_secs(2), "the driver does not notice");
+    }
+    std::thread::sleep(Duration::from_secs(1).saturating_sub(pulled.elapsed()));
+    drive("bind");
+    let (image, took) = back_after(&mut camera, Instant::now());
+    println!("plugged in again: images after {took:.0?}, {} counted as lost", image.n_skipped);
+    assert!(took < Duration::from_secs(1), "{took:?}");
+    // A second without a camera, and what binding took.
+    assert!((20..=60).contains(&image.n_skipped), "{} images counted for the outage", image.n_skipped);
+    set(&camera);
+    Seen::during(&mut camera, 2.0).report("after the replug", rate_hz);
+}
+
+#[test]
+#[ignore = "runs in the virtual kernel"]
+fn a_camera_that_stays_away_is_an_error_after_its_time() {
+    let wait = Duration::from_secs(1);
+    let mut camera =
+        V4l2Camera::open(Config { reconnect_for: wait, ..config(WEBCAM, [320, 180], 25.0) }).expect("vivid opens");
+    Seen::during(&mut camera, 0.2);
+    drive("unbind");
+    let began = Instant::now();
+    let error = loop {
+        match camera.next_image(Duration::from_millis(100)) {
+            Ok(_) | Err(Error::Reconnecting { .. }) => assert!(began.elapsed() < 5 * wait, "no end to it"),
+            Err(error) => break error.to_string(),
+        }
+    };
+    drive("bind");
+    println!("stays away: {error}");
+    assert!(error.contains("\"front\"") && error.contains("not there again after"), "{error}");
+    assert!(began.elapsed() >= wait && began.elapsed() < 2 * wait, "{:?}", began.elapsed());
+}
+
+#[test]
+#[ignore = "runs in the virtual kernel"]
+fn all_formats_show_the_same_picture() {
+    use V4l2Format::{Bgr, Grey, Nv12, Rgb, Uyvy, Yuyv};
+    let size_px = [640, 360];
+    let picture = |format| {
+        let config = Config { format: Some(format), ..config(WEBCAM, size_px, 25.0) };
+        let mut camera = V4l2Camera::open(config).expect("vivid has this format");
+        camera.next_image(Duration::from_secs(2)).expect("vivid streams").decode_rgb().expect("raw pixels")
+    };
+    let rgb = picture(Rgb);
+    // Vivid's test picture are color bars; its text over them counts the images, so a share of the pixels differs.
+    let distinct: std::collections::BTreeSet<&[u8]> = rgb.chunks_exact(3).collect();
+    assert!(distinct.len() >= 8, "{} colors", distinct.len());
+    for format in [Bgr, Yuyv, Uyvy, Nv12] {
+        let other = picture(format);
+        let off = |(a, b): (&u8, &u8)| a.abs_diff(*b) > 6;
+        let n_off = rgb.iter().zip(&other).filter(|(a, b)| off((a, b))).count();
+        let frac = n_off as f64 / rgb.len() as f64;
+        println!("{}: {:.2} % of the counts differ from rgb", format.name(), 100.0 * frac);
+        assert!(frac < 0.04, "{}: {frac}", format.name());
+    }
+    let luma = |rgb: &[u8]| rgb.chunks_exact(3).map(|p| 0.299 * f64::from(p[0]) + 0.587 * f64::from(p[1]) + 0.114 * f64::from(p[2])).sum::<f64>();
+    let (of_grey, of_rgb) = (luma(&picture(Grey)), luma(&rgb));
+    println!("grey: mean brightness {:.4} of that of rgb", of_grey / of_rgb);
+    assert!((of_grey / of_rgb - 1.0).abs() < 0.1);
+}
+
+#[test]
+#[ignore = "runs in the virtual kernel"]
+fn the_newest_image_is_delivered_where_that_is_asked_for() {
+    let rate_hz = 25.0;
+    let of = |delivery| {
+        let mut camera =
+            V4l2Camera::open(Config { delivery, ..config(WEBCAM, [640, 360], rate_hz) }).expect("vivid opens");
+        let mut images = Vec::new();
+        for _ in 0..8 {
+            std::thread::sleep(Duration::from_millis(200));
+            images.push(camera.next_image(Duration::from_secs(2)).expect("vivid streams"));
+        }
+        let behind = (drivers::clock::now().0 - images.last().expect("eight").stamp.0) as f64 * 1e-9;
+        (Seen { images, elapsed: Duration::default() }.report(&format!("{delivery:?}, every 200 ms"), rate_hz), behind)
+    };
+    let ((_, n_lost), behind_secs) = of(Delivery::Newest);
+    assert!(n_lost >= 20, "{n_lost} lost of five images each 200 ms");
+    assert!(behind_secs < 0.08, "the newest image is {behind_secs} s old");
+    let (_, behind_secs) = of(Delivery::Every);
+    assert!(behind_secs > 0.2, "the oldest waiting image is only {behind_secs} s old");
+}
+
+#[test]
+#[ignore = "runs in the virtual kernel"]
+fn what_cannot_be_is_refused_with_what_can() {
+    let refused = |config| V4l2Camera::open(config).expect_err("vivid cannot do that").to_string();
+    let size = refused(config(WEBCAM, [800, 600], 25.0));
+    println!("{}", &size[..200]);
+    assert!(size.contains("color 800x600 at 25 Hz") && size.contains("yuyv 640x360 at"), "{size}");
+    let fast = refused(config(WEBCAM, [1920, 1080], 60.0));
+    assert!(fast.contains("1920x1080 at 60 Hz"), "{fast}");
+    let jpeg = refused(Config { format: Some(V4l2Format::Mjpeg), ..config(WEBCAM, [640, 360], 25.0) });
+    assert!(jpeg.contains("mjpeg 640x360"), "{jpeg}");
+    let balance = Settings { white_balance_kelvin: Some(4600), ..Settings::default() };
+    let balance = refused(Config { settings: balance, ..config(WEBCAM, [640, 360], 25.0) });
+    assert!(balance.contains("no control for v4l2.white_balance_kelvin"), "{balance}");
+    let gain = refused(Config { settings: Settings { gain: Some(300), ..SETTINGS }, ..config(WEBCAM, [640, 360], 25.0) });
+    assert!(gain.contains("v4l2.gain is 300, it takes 0 to 255"), "{gain}");
+    let _streams = V4l2Camera::open(config(WEBCAM, [640, 360], 25.0)).expect("vivid opens");
+    let busy = refused(config(WEBCAM, [640, 360], 25.0));
+    println!("{busy}");
+    assert!(busy.contains("another program uses it"), "{busy}");
+}
+
+#[test]
+#[ignore = "runs in the virtual kernel"]
+fn the_program_lists_and_records_the_camera() {
+    let fieldrig = |args: &[&str]| {
+        let output = Command::new("/bin/fieldrig").args(args).current_dir("/tmp").output().expect("it starts");
+        let text = String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr);
+        println!("fieldrig {}:\n{text}", args.join(" "));
+        (output.status.code(), text)
+    };
+    let (code, text) = fieldrig(&["devices"]);
+    assert_eq!(code, Some(0));
+    assert!(text.contains(WEBCAM) && text.contains(GRABBER), "both cameras by a name that stays");
+    let (_, text) = fieldrig(&["doctor"]);
+    assert!(text.contains("cameras"), "{text}");
+    let (code, text) = fieldrig(&["record", "/rigs/vivid.toml", "--out", "/tmp/vivid.mcap", "--seconds", "4", "--json"]);
+    assert!(code == Some(0) || code == Some(3), "recorded, with loss at most: {code:?}");
+    let done = text.lines().find(|line| line.contains("\"done\"")).expect("a summary");
+    let done: serde_json::Value = serde_json::from_str(done).expect("JSON");
+    let number = |key: &str| done[key].as_u64().expect("a number");
+    let (images, lost) = (number("images"), number("images_lost_by_devices"));
+    assert!((98..=103).contains(&(images + lost)), "{images} and {lost} lost in 4 s at 25 Hz");
+    let node = node(WEBCAM);
+    assert_eq!((v4l2::control(&node, GAIN).ok(), v4l2::control(&node, BRIGHTNESS).ok()), (Some(77), Some(99)));
+    let mut recording = drivers::recording::Recording::open(Path::new("/tmp/vivid.mcap")).expect("a recording");
+    let mut n_read = 0;
+    while let Some(sample) = drivers::Source::next_sample(&mut recording).expect("readable") {
+        if let drivers::Sample::Image(image) = sample {
+            n_read += 1;
+            assert_eq!(image.exposure_secs, Some(0.004), "vivid has no exposure control: the rig file knows it");
+            assert_eq!(image.decode_rgb().expect("uyvy").len(), 640 * 360 * 3);
+        }
+    }
+    assert_eq!(n_read, images);
+}
