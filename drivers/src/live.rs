@@ -302,15 +302,16 @@ mod tests {
         }
     }
 
+    const LENS: Intrinsics = Intrinsics {
+        size_px: [1, 1],
+        focal_px: [1.0; 2],
+        principal_px: [0.5; 2],
+        lens: Lens::Pinhole,
+        rectified: true,
+    };
+
     fn fast(n_images: i64) -> Box<dyn Camera> {
-        let intrinsics = Intrinsics {
-            size_px: [1, 1],
-            focal_px: [1.0; 2],
-            principal_px: [0.5; 2],
-            lens: Lens::Pinhole,
-            rectified: true,
-        };
-        Box::new(Fast { intrinsics, n_images, next: 0 })
+        Box::new(Fast { intrinsics: LENS, n_images, next: 0 })
     }
 
     struct Still {
@@ -347,6 +348,41 @@ mod tests {
         }
         assert_eq!(stamps, (94..=101).collect::<Vec<_>>());
         assert_eq!(n_skipped, [47, 46], "51 colour images with 4 delivered, 50 depth images with 4 delivered");
+    }
+
+    /// A camera whose cable is out for longer than a silent one is waited for; it waits for nothing itself.
+    struct Unplugged {
+        camera: Fast,
+        n_tries: u32,
+    }
+
+    impl Camera for Unplugged {
+        fn name(&self) -> &str {
+            self.camera.name()
+        }
+        fn intrinsics(&self) -> &Intrinsics {
+            self.camera.intrinsics()
+        }
+        fn next_image(&mut self, timeout: Duration) -> Result<Image, Error> {
+            self.n_tries += 1;
+            if self.n_tries <= 100 {
+                return Err(Error::Reconnecting { camera: "fast".into(), waited: timeout * self.n_tries });
+            }
+            self.camera.next_image(timeout)
+        }
+    }
+
+    #[test]
+    fn a_camera_that_is_looked_for_is_not_silent() {
+        let camera = Unplugged { camera: Fast { intrinsics: LENS, n_images: 1, next: 0 }, n_tries: 0 };
+        let devices = Devices { cameras: vec![Box::new(camera)], ..Devices::default() };
+        let mut live = Live::new(devices).expect("threads start");
+        while live.shared.lock().n_running > 0 {
+            std::thread::yield_now();
+        }
+        // The image came after ten seconds of looking, and the error is the one after it.
+        assert!(live.next_sample().expect_err("the cable").to_string().contains("cable pulled"));
+        assert_eq!(live.next_sample().expect("told once").expect("an image").stamp(), Stamp(1));
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 use crate::exit::Exit;
 use crate::print;
+use drivers::v4l2;
 use serde::Serialize;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
@@ -65,6 +66,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     findings.push(memory(Path::new("/proc")));
     findings.push(realtime(Path::new("/proc")));
     findings.push(cameras(Path::new("/dev")));
+    findings.extend(v4l2::cameras().into_iter().flatten().filter_map(|camera| usb(&camera)));
     findings.push(port(USUAL_ADDRESS));
     for finding in &findings {
         if args.json {
@@ -236,6 +238,19 @@ fn cameras(dev: &Path) -> Finding {
     Finding::warn("cameras", says, "sudo usermod -aG video $USER, then log in again")
 }
 
+/// What a camera on USB offers and its port cannot carry.
+fn usb(camera: &v4l2::Found) -> Option<Finding> {
+    let carries = format!("{:.1} MB/s", camera.usb_bytes_per_sec()? * 1e-6);
+    let name = format!("{} ({})", camera.name, camera.node.display());
+    let beyond = camera.beyond_usb();
+    if beyond.is_empty() {
+        return Some(Finding::ok("usb", format!("{name}: its port carries {carries}, enough for all that it offers")));
+    }
+    let says = format!("{name}: its port carries {carries} at most, too little for {}", beyond.join(", "));
+    let mend = "choose v4l2.format = \"mjpeg\", a smaller size or a lower rate, or a USB 3 port; `lsusb -t` shows who shares one";
+    Some(Finding::warn("usb", says, mend))
+}
+
 fn port(address: &str) -> Finding {
     match TcpListener::bind(address) {
         Ok(_) => Finding::ok("network", format!("{address} is free for the page")),
@@ -283,6 +298,26 @@ mod tests {
         let path = "devices/system/clocksource/clocksource0/current_clocksource";
         assert_eq!(clock_source(folder_with(path, "hpet\n").path()).verdict, Verdict::Warn);
         assert_eq!(clock_source(folder_with(path, "tsc\n").path()).verdict, Verdict::Ok);
+    }
+
+    #[test]
+    fn a_port_too_slow_for_its_camera_is_told() {
+        let mut camera = v4l2::Found {
+            node: "/dev/video0".into(),
+            name: "1440p".into(),
+            bus: "usb-1".into(),
+            serial: None,
+            links: Vec::new(),
+            usb_mbits: Some(480.0),
+            modes: vec![v4l2::Mode::new(v4l2::V4l2Format::Yuyv, [2560, 1440], &[30.0])],
+        };
+        let finding = usb(&camera).expect("a camera on USB");
+        assert_eq!(finding.verdict, Verdict::Warn);
+        assert!(finding.says.contains("24.6 MB/s") && finding.says.contains("221 MB/s"), "{}", finding.says);
+        camera.usb_mbits = Some(5000.0);
+        assert_eq!(usb(&camera).expect("a camera on USB").verdict, Verdict::Ok);
+        camera.usb_mbits = None;
+        assert_eq!(usb(&camera), None);
     }
 
     #[test]

@@ -37,6 +37,7 @@ intrinsics = { focal_px = [300, 300], principal_px = [160.0, 120.0], lens = "bro
 [range.lidar]
 driver = "udp"
 [range.lidar.sim]
+[camera.wrist.v4l2]
 "#;
 
 fn parse(text: &str, overrides: &[Override]) -> Result<Rig, ConfigError> {
@@ -49,8 +50,9 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a good value that differs from the one in force, and a value that is not allowed.
-const KEYS: [(&str, &str, &str); 109] = [
+const KEYS: [(&str, &str, &str); 118] = [
     ("arm.driver", "'franka'", "'frankka'"),
+    ("arm.driver", "'none'", "'nothing'"),
     ("arm.address", "'172.16.0.2'", "7"),
     ("arm.urdf", "'other.urdf'", "7"),
     ("arm.joints", "['j2', 'j1']", "['j1', 'j9']"),
@@ -96,6 +98,14 @@ const KEYS: [(&str, &str, &str); 109] = [
     ("camera.wrist.intrinsics.lens", "'pinhole'", "'fisheye'"),
     ("camera.wrist.intrinsics.distortion", "[0, 0, 0, 0, 0.1]", "[0.1]"),
     ("camera.wrist.rectified", "true", "1"),
+    ("camera.wrist.v4l2.format", "'mjpeg'", "'h264'"),
+    ("camera.wrist.v4l2.gain", "12", "1.5"),
+    ("camera.wrist.v4l2.brightness", "-12", "'bright'"),
+    ("camera.wrist.v4l2.white_balance_kelvin", "4600", "46"),
+    ("camera.wrist.v4l2.delivery", "'newest'", "'some'"),
+    ("camera.wrist.v4l2.reconnect_secs", "5", "-1"),
+    ("camera.wrist.depth.device", "'/dev/video9'", "9"),
+    ("camera.wrist.depth.metres_per_count", "0.001", "0"),
     ("camera.wrist.depth.size_px", "[640, 480]", "[4, 4]"),
     ("camera.wrist.depth.intrinsics.focal_px", "[301, 300]", "[300]"),
     ("camera.wrist.depth.intrinsics.principal_px", "[161, 120]", "160"),

@@ -1,11 +1,11 @@
-//! Inside the virtual kernel: the V4L2 driver against vivid. Two devices: `vivid-000` is a webcam, `vivid-001` an HDMI grabber.
+//! Inside the virtual kernel: the V4L2 driver against vivid. Two devices: `vivid-000` is a webcam, `vivid-001` a grabber of television.
 //!
 //! vivid has no exposure control and no MJPEG: those are tested with tables and files beside their code.
 
 use drivers::v4l2::{self, Config, Counts, Delivery, Settings, V4l2Camera, V4l2Format};
 use drivers::{Camera, Error, Image};
 use kinematics::{Intrinsics, Lens};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -44,7 +44,7 @@ fn config(device: &str, size_px: [u32; 2], rate_hz: f64) -> Config {
 
 /// The node of a device now; it may have another number after a replug.
 fn node(bus: &str) -> PathBuf {
-    v4l2::cameras().into_iter().find(|found| found.bus == bus).expect("vivid is there").node
+    v4l2::cameras().into_iter().flatten().find(|found| found.bus == bus).expect("vivid is there").node
 }
 
 /// What came in a stretch of time.
@@ -68,18 +68,27 @@ impl Seen {
         Self { images, elapsed: began.elapsed() }
     }
 
-    /// Delivered and lost after the first image, and how many the stamps say there were: two counts that share nothing.
-    fn counts(&self, rate_hz: f64) -> (u64, u64, u64) {
-        let delivered = self.images.len() as u64 - 1;
-        let lost = self.images[1..].iter().map(|image| image.n_skipped).sum();
-        let secs = (self.images.last().expect("images").stamp.0 - self.images[0].stamp.0) as f64 * 1e-9;
-        (delivered, lost, (secs * rate_hz).round() as u64)
-    }
-
+    /// Delivered and lost after the first image, once the stamps say the same: two counts that share nothing.
     fn report(&self, what: &str, rate_hz: f64) -> (u64, u64) {
-        let (delivered, lost, by_stamps) = self.counts(rate_hz);
-        println!("{what}: {delivered} images and {lost} lost ones in {:.2?}; {by_stamps} by their stamps", self.elapsed);
-        assert_eq!(delivered + lost, by_stamps, "{what}: a lost image was not counted, or one too many was");
+        let first = self.images[0].stamp;
+        let mut number = 0;
+        // How late each image is for its number, periods. A miscount moves all that follow by one; a busy machine only adds.
+        let late: Vec<f64> = (self.images.iter().enumerate())
+            .map(|(ix, image)| {
+                number += if ix == 0 { 0 } else { 1 + image.n_skipped };
+                (image.stamp.0 - first.0) as f64 * 1e-9 * rate_hz - number as f64
+            })
+            .collect();
+        let third = late.len().div_ceil(3);
+        let least = |late: &[f64]| late.iter().copied().fold(f64::INFINITY, f64::min);
+        let drift = least(&late[late.len() - third..]) - least(&late[..third]);
+        let delivered = self.images.len() as u64 - 1;
+        let lost = number - delivered;
+        println!(
+            "{what}: {delivered} images and {lost} lost ones in {:.2?}; by their stamps {drift:+.2} more",
+            self.elapsed
+        );
+        assert!(drift.abs() < 0.5, "{what}: a lost image was not counted, or one too many was");
         let in_order = self.images.windows(2).all(|pair| pair[0].stamp < pair[1].stamp);
         assert!(in_order, "{what}: stamps go back");
         (delivered, lost)
@@ -89,9 +98,9 @@ impl Seen {
 #[test]
 #[ignore = "runs in the virtual kernel"]
 fn every_lost_image_is_counted_in_ten_seconds() {
-    for (device, size_px, rate_hz) in
-        [(WEBCAM, [640, 360], 25.0), (WEBCAM, [1920, 1080], 5.0), (GRABBER, [1920, 1080], 60.0)]
-    {
+    // As a webcam vivid is slow at 1080p, as a grabber it is not.
+    for (device, size_px) in [(WEBCAM, [640, 360]), (GRABBER, [1920, 1080])] {
+        let rate_hz = 25.0;
         let mut camera = V4l2Camera::open(config(device, size_px, rate_hz)).expect("vivid opens");
         let what = format!("{device} {}x{} at {rate_hz} Hz", size_px[0], size_px[1]);
         let seen = Seen::during(&mut camera, 10.0);
@@ -100,7 +109,10 @@ fn every_lost_image_is_counted_in_ten_seconds() {
         assert_eq!((n_images, n_damaged, n_reconnections), (delivered + 1, 0, 0));
         assert_eq!(n_skipped, lost + seen.images[0].n_skipped);
         let first = &seen.images[0];
-        assert_eq!(first.decode_rgb().expect("raw pixels").len(), size_px.map(|side| side as usize).iter().product::<usize>() * 3);
+        assert_eq!(
+            first.decode_rgb().expect("raw pixels").len(),
+            size_px.map(|side| side as usize).iter().product::<usize>() * 3
+        );
     }
 }
 
@@ -122,7 +134,9 @@ fn back_after(camera: &mut V4l2Camera, began: Instant) -> (Image, Duration) {
     loop {
         match camera.next_image(Duration::from_millis(100)) {
             Ok(image) => return (image, began.elapsed()),
-            Err(Error::NoImage { .. } | Error::Reconnecting { .. }) => assert!(began.elapsed() < Duration::from_secs(5)),
+            Err(Error::NoImage { .. } | Error::Reconnecting { .. }) => {
+                assert!(began.elapsed() < Duration::from_secs(5))
+            }
             Err(other) => panic!("{other}"),
         }
     }
@@ -205,28 +219,33 @@ fn a_camera_that_stays_away_is_an_error_after_its_time() {
 #[ignore = "runs in the virtual kernel"]
 fn all_formats_show_the_same_picture() {
     use V4l2Format::{Bgr, Grey, Nv12, Rgb, Uyvy, Yuyv};
+    // Vivid works brightness into its pictures in another way for each format: the value that changes nothing.
+    const PLAIN: Settings = Settings { brightness: Some(128), ..SETTINGS };
     let size_px = [640, 360];
     let picture = |format| {
-        let config = Config { format: Some(format), ..config(WEBCAM, size_px, 25.0) };
+        let config = Config { format: Some(format), settings: PLAIN, ..config(WEBCAM, size_px, 25.0) };
         let mut camera = V4l2Camera::open(config).expect("vivid has this format");
         camera.next_image(Duration::from_secs(2)).expect("vivid streams").decode_rgb().expect("raw pixels")
     };
     let rgb = picture(Rgb);
-    // Vivid's test picture are color bars; its text over them counts the images, so a share of the pixels differs.
-    let distinct: std::collections::BTreeSet<&[u8]> = rgb.chunks_exact(3).collect();
-    assert!(distinct.len() >= 8, "{} colors", distinct.len());
+    // Eight bars with text above: one pixel from the middle of each bar, low in the picture.
+    let bars = |rgb: &[u8]| -> Vec<u8> {
+        (0..8).flat_map(|bar| rgb[(330 * 640 + bar * 80 + 40) * 3..][..3].to_vec()).collect()
+    };
+    let wanted = bars(&rgb);
+    assert_eq!(wanted.chunks_exact(3).collect::<BTreeSet<_>>().len(), 8, "{wanted:?}");
     for format in [Bgr, Yuyv, Uyvy, Nv12] {
-        let other = picture(format);
-        let off = |(a, b): (&u8, &u8)| a.abs_diff(*b) > 6;
-        let n_off = rgb.iter().zip(&other).filter(|(a, b)| off((a, b))).count();
-        let frac = n_off as f64 / rgb.len() as f64;
-        println!("{}: {:.2} % of the counts differ from rgb", format.name(), 100.0 * frac);
-        assert!(frac < 0.04, "{}: {frac}", format.name());
+        let got = bars(&picture(format));
+        let most = wanted.iter().zip(&got).map(|(a, b)| a.abs_diff(*b)).max();
+        println!("{}: off by {most:?} of 255 at most", format.name());
+        // Rounding to counts of a limited range, there and back.
+        assert!(most <= Some(3), "{}: {wanted:?}, got {got:?}", format.name());
     }
-    let luma = |rgb: &[u8]| rgb.chunks_exact(3).map(|p| 0.299 * f64::from(p[0]) + 0.587 * f64::from(p[1]) + 0.114 * f64::from(p[2])).sum::<f64>();
-    let (of_grey, of_rgb) = (luma(&picture(Grey)), luma(&rgb));
-    println!("grey: mean brightness {:.4} of that of rgb", of_grey / of_rgb);
-    assert!((of_grey / of_rgb - 1.0).abs() < 0.1);
+    let gray = bars(&picture(Grey));
+    let is_gray = gray.chunks_exact(3).all(|pixel| pixel[0] == pixel[1] && pixel[1] == pixel[2]);
+    let falls = gray.chunks_exact(3).collect::<Vec<_>>().windows(2).all(|pair| pair[0][0] > pair[1][0]);
+    println!("grey: {:?}", gray.chunks_exact(3).map(|pixel| pixel[0]).collect::<Vec<_>>());
+    assert!(is_gray && falls, "the bars go from bright to dark: {gray:?}");
 }
 
 #[test]
@@ -256,8 +275,8 @@ fn the_newest_image_is_delivered_where_that_is_asked_for() {
 fn what_cannot_be_is_refused_with_what_can() {
     let refused = |config| V4l2Camera::open(config).expect_err("vivid cannot do that").to_string();
     let size = refused(config(WEBCAM, [800, 600], 25.0));
-    println!("{}", &size[..200]);
-    assert!(size.contains("color 800x600 at 25 Hz") && size.contains("yuyv 640x360 at"), "{size}");
+    println!("{size}");
+    assert!(size.contains("color 800x600 at 25 Hz") && size.contains("640x360 up to 40 Hz"), "{size}");
     let fast = refused(config(WEBCAM, [1920, 1080], 60.0));
     assert!(fast.contains("1920x1080 at 60 Hz"), "{fast}");
     let jpeg = refused(Config { format: Some(V4l2Format::Mjpeg), ..config(WEBCAM, [640, 360], 25.0) });
@@ -265,7 +284,8 @@ fn what_cannot_be_is_refused_with_what_can() {
     let balance = Settings { white_balance_kelvin: Some(4600), ..Settings::default() };
     let balance = refused(Config { settings: balance, ..config(WEBCAM, [640, 360], 25.0) });
     assert!(balance.contains("no control for v4l2.white_balance_kelvin"), "{balance}");
-    let gain = refused(Config { settings: Settings { gain: Some(300), ..SETTINGS }, ..config(WEBCAM, [640, 360], 25.0) });
+    let gain =
+        refused(Config { settings: Settings { gain: Some(300), ..SETTINGS }, ..config(WEBCAM, [640, 360], 25.0) });
     assert!(gain.contains("v4l2.gain is 300, it takes 0 to 255"), "{gain}");
     let _streams = V4l2Camera::open(config(WEBCAM, [640, 360], 25.0)).expect("vivid opens");
     let busy = refused(config(WEBCAM, [640, 360], 25.0));
@@ -285,9 +305,11 @@ fn the_program_lists_and_records_the_camera() {
     let (code, text) = fieldrig(&["devices"]);
     assert_eq!(code, Some(0));
     assert!(text.contains(WEBCAM) && text.contains(GRABBER), "both cameras by a name that stays");
+    assert!(text.contains("vcan0"), "the CAN bus that the start script made");
     let (_, text) = fieldrig(&["doctor"]);
     assert!(text.contains("cameras"), "{text}");
-    let (code, text) = fieldrig(&["record", "/rigs/vivid.toml", "--out", "/tmp/vivid.mcap", "--seconds", "4", "--json"]);
+    let (code, text) =
+        fieldrig(&["record", "/rigs/vivid.toml", "--out", "/tmp/vivid.mcap", "--seconds", "4", "--json"]);
     assert!(code == Some(0) || code == Some(3), "recorded, with loss at most: {code:?}");
     let done = text.lines().find(|line| line.contains("\"done\"")).expect("a summary");
     let done: serde_json::Value = serde_json::from_str(done).expect("JSON");

@@ -4,11 +4,13 @@
 //! The test below runs on the host: it lays out a root folder with this very program in it, boots the kernel on it and reads its
 //! console. Inside, the same program runs the tests of `cameras.rs`, which are ignored outside.
 
+#![expect(clippy::print_stdout, reason = "the report of what was seen in the virtual kernel")]
+
 mod cameras;
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::io::Read;
+use std::io::{Read, Write};
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
@@ -20,9 +22,11 @@ const INIT: &str = r#"#!/bin/busybox sh
 bb=/bin/busybox
 $bb mount -t proc proc /proc
 $bb mount -t sysfs sysfs /sys
-$bb mount -t devtmpfs dev /dev
 $bb mount -t tmpfs tmp /tmp
-export RUST_BACKTRACE=1
+$bb ip link set lo up
+$bb ip link add dev vcan0 type vcan
+$bb ip link set vcan0 up
+export LD_LIBRARY_PATH=/lib
 /bin/hil --ignored --test-threads=1 --nocapture
 echo "hil: exit $?"
 $bb poweroff -f
@@ -47,10 +51,9 @@ fn cameras_in_a_kernel_of_their_own() {
     let root = folder.join("root");
     lay_out(&root);
     let console = boot(&kernel, &root, &folder);
-    println!("{console}");
+    // Past what the test harness holds back: the report is to be seen when all is well, too.
+    std::io::stderr().write_all(console.as_bytes()).expect("stderr is open");
     assert!(console.contains("hil: exit 0"), "the tests in the virtual kernel failed; its console is above");
-    let n_passed = console.matches("... ok").count() + console.matches("\nok\n").count();
-    println!("{n_passed} tests passed in the virtual kernel");
 }
 
 /// Why the tests cannot run here.
@@ -85,7 +88,7 @@ fn build_kernel(folder: &Path) -> PathBuf {
 /// A root folder: busybox, this program, `fieldrig`, and the libraries that these need.
 fn lay_out(root: &Path) {
     let _ = fs::remove_dir_all(root); // Not there the first time.
-    for folder in ["bin", "dev", "proc", "sys", "tmp", "rigs"] {
+    for folder in ["bin", "dev", "lib", "proc", "rigs", "sys", "tmp"] {
         fs::create_dir_all(root.join(folder)).expect("room on the disk");
     }
     fs::copy("/usr/bin/busybox", root.join("bin/busybox")).expect("busybox-static");
@@ -100,9 +103,14 @@ fn lay_out(root: &Path) {
         libraries.extend(libraries_of(&program));
     }
     for library in libraries {
-        let place = root.join(library.strip_prefix("/").expect("ldd prints whole paths"));
-        fs::create_dir_all(place.parent().expect("inside the root")).expect("room on the disk");
-        fs::copy(&library, place).expect("ldd found it");
+        let name = library.file_name().expect("a file");
+        fs::copy(&library, root.join("lib").join(name)).expect("ldd found it");
+        // The dynamic linker is looked for where the programs say, the rest by LD_LIBRARY_PATH.
+        if name.to_string_lossy().starts_with("ld-") {
+            let place = root.join(library.strip_prefix("/").expect("ldd prints whole paths"));
+            fs::create_dir_all(place.parent().expect("inside the root")).expect("room on the disk");
+            fs::copy(&library, place).expect("ldd found it");
+        }
     }
     let rig = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/hil/vivid.toml");
     fs::copy(rig, root.join("rigs/vivid.toml")).expect("room on the disk");
@@ -124,7 +132,7 @@ fn boot(kernel: &Path, root: &Path, folder: &Path) -> String {
         .args(["mem=768M", "rootfstype=hostfs", "ro", "init=/init", "quiet", "panic=1"])
         .arg(format!("rootflags={}", root.display()))
         .args(["con=null", "con0=null,fd:1", "ssl=null"])
-        .args(["vivid.n_devs=2", "vivid.node_types=0x1,0x1", "vivid.num_inputs=1,1", "vivid.input_types=0x0,0x0"])
+        .args(["vivid.n_devs=2", "vivid.node_types=0x1,0x1", "vivid.num_inputs=1,1", "vivid.input_types=0x0,0x1"])
         // The memory of the kernel is a file: /dev/shm is often too small for it.
         .env("TMPDIR", folder)
         .stdin(Stdio::null())

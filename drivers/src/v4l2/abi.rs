@@ -7,7 +7,8 @@ use rustix::ioctl::{Opcode, opcode};
 pub(super) const VIDEO_CAPTURE: u32 = 1;
 /// `V4L2_MEMORY_MMAP`.
 pub(super) const MEMORY_MMAP: u32 = 1;
-/// `V4L2_FIELD_NONE`: whole images, not every other row.
+/// `V4L2_FIELD_ANY` and `V4L2_FIELD_NONE`: whole images, not every other row.
+pub(super) const FIELD_ANY: u32 = 0;
 pub(super) const FIELD_NONE: u32 = 1;
 
 /// `V4L2_CAP_*`.

@@ -2,7 +2,7 @@
 
 use super::Problem;
 use super::device::Device;
-use super::format::{Mode, Rates, Sizes, V4l2Format};
+use super::format::{self, Mode, Rates, Sizes, V4l2Format};
 use std::path::{Path, PathBuf};
 
 /// One node of a V4L2 device that gives images.
@@ -30,6 +30,16 @@ impl Found {
         let link = self.links.first().map(|link| link.display().to_string());
         link.or_else(|| self.serial.clone()).unwrap_or_else(|| self.bus.clone())
     }
+
+    /// Bytes a second that its USB carries to one camera; `None` elsewhere.
+    pub fn usb_bytes_per_sec(&self) -> Option<f64> {
+        self.usb_mbits.map(format::usb_bytes_per_sec)
+    }
+
+    /// What it offers that its USB cannot carry, for people.
+    pub fn beyond_usb(&self) -> Vec<String> {
+        self.usb_bytes_per_sec().map_or(Vec::new(), |bytes_per_sec| format::beyond(&self.modes, bytes_per_sec))
+    }
 }
 
 /// What sysfs tells of a node without opening it.
@@ -40,16 +50,17 @@ struct Node {
     usb_mbits: Option<f64>,
 }
 
-/// All that give images and may be opened.
-pub fn cameras() -> Vec<Found> {
+/// All that give images, and why the others cannot be opened; nodes of metadata are left out.
+pub fn cameras() -> Vec<Result<Found, Problem>> {
     let root = Path::new("/");
-    nodes(root).into_iter().filter_map(|node| describe(root, node)).collect()
+    nodes(root).into_iter().filter_map(|node| describe(root, node).transpose()).collect()
 }
 
-fn describe(root: &Path, node: Node) -> Option<Found> {
-    let device = Device::open(&node.path).ok()?;
-    let identity = device.identity().ok().filter(|identity| identity.streams_images)?;
-    Some(Found {
+fn describe(root: &Path, node: Node) -> Result<Option<Found>, Problem> {
+    let device =
+        Device::open(&node.path).map_err(|error| Problem::Open { path: node.path.clone(), source: error.into() })?;
+    let Some(identity) = device.identity().ok().filter(|identity| identity.streams_images) else { return Ok(None) };
+    Ok(Some(Found {
         name: identity.card,
         bus: identity.bus,
         serial: node.serial,
@@ -57,7 +68,7 @@ fn describe(root: &Path, node: Node) -> Option<Found> {
         usb_mbits: node.usb_mbits,
         modes: modes(&device),
         node: node.path,
-    })
+    }))
 }
 
 /// All that a device offers of what is read here.

@@ -4,7 +4,6 @@
 
 use super::abi::{DISCRETE, Fraction, FrameInterval, FrameSize};
 use crate::{Error, PixelFormat, V4l2Colors, YuvColors, YuvLayout};
-use std::fmt;
 
 /// Rates that differ by less than this share are the same: devices tell fractions of whole numbers.
 const SAME_RATE_FRAC: f64 = 0.01;
@@ -31,9 +30,9 @@ pub enum V4l2Format {
 }
 
 impl V4l2Format {
-    /// All of them with their names in rig files; those of color in the order in which they are preferred: what is
-    /// not compressed before what is, colors before grey.
-    pub const ALL: [(&str, Self); 8] = [
+    /// Those of color with their names in rig files, in the order in which they are preferred: what is not compressed before
+    /// what is, colors before grey.
+    pub const OF_COLOR: [(&str, Self); 7] = [
         ("yuyv", Self::Yuyv),
         ("uyvy", Self::Uyvy),
         ("nv12", Self::Nv12),
@@ -41,27 +40,35 @@ impl V4l2Format {
         ("bgr", Self::Bgr),
         ("mjpeg", Self::Mjpeg),
         ("grey", Self::Grey),
-        ("z16", Self::Z16),
     ];
 
     /// Its name in rig files.
     pub fn name(self) -> &'static str {
-        Self::ALL.iter().find(|(_, format)| *format == self).map_or("", |(name, _)| name)
+        Self::OF_COLOR.iter().find(|(_, format)| *format == self).map_or("z16", |(name, _)| name)
     }
 
-    /// The format of a code of the kernel.
+    /// Codes of the kernel; some devices call MJPEG by another.
+    const CODES: [(&[u8; 4], Self); 9] = [
+        (b"YUYV", Self::Yuyv),
+        (b"UYVY", Self::Uyvy),
+        (b"NV12", Self::Nv12),
+        (b"RGB3", Self::Rgb),
+        (b"BGR3", Self::Bgr),
+        (b"MJPG", Self::Mjpeg),
+        (b"JPEG", Self::Mjpeg),
+        (b"GREY", Self::Grey),
+        (b"Z16 ", Self::Z16),
+    ];
+
+    /// The format of a code.
     pub(super) fn from_fourcc(fourcc: u32) -> Option<Self> {
-        Some(match &fourcc.to_le_bytes() {
-            b"YUYV" => Self::Yuyv,
-            b"UYVY" => Self::Uyvy,
-            b"NV12" => Self::Nv12,
-            b"RGB3" => Self::Rgb,
-            b"BGR3" => Self::Bgr,
-            b"MJPG" | b"JPEG" => Self::Mjpeg,
-            b"GREY" => Self::Grey,
-            b"Z16 " => Self::Z16,
-            _ => return None,
-        })
+        Self::CODES.iter().find(|(code, _)| u32::from_le_bytes(**code) == fourcc).map(|(_, format)| *format)
+    }
+
+    /// The usual code of a format.
+    fn fourcc(self) -> u32 {
+        let usual = Self::CODES.iter().find(|(_, format)| *format == self);
+        usual.map_or(0, |(code, _)| u32::from_le_bytes(**code))
     }
 
     /// Bytes a second of images of a size at a rate; `None` where compression decides.
@@ -137,6 +144,13 @@ pub enum Rates {
     },
 }
 
+impl Mode {
+    /// A format at one size with the rates of a list.
+    pub fn new(format: V4l2Format, size_px: [u32; 2], rates_hz: &[f64]) -> Self {
+        Self { fourcc: format.fourcc(), format, sizes: Sizes::One(size_px), rates: Rates::List(rates_hz.to_vec()) }
+    }
+}
+
 impl Sizes {
     pub(super) fn from_kernel(told: &FrameSize) -> Self {
         let [a, b, c, d, e, f] = told.numbers;
@@ -188,14 +202,44 @@ impl Rates {
     }
 }
 
-/// The mode to take: of a format, if one is asked for, else the first in the order of [`V4l2Format::ALL`] but for depth.
+/// The mode to take: of a format, if one is asked for, else the first in the order of [`V4l2Format::OF_COLOR`].
 pub(super) fn choose(modes: &[Mode], format: Option<V4l2Format>, size_px: [u32; 2], rate_hz: f64) -> Option<&Mode> {
     let fits = |mode: &&Mode| mode.sizes.has(size_px) && mode.rates.has(rate_hz);
     let of = |format: V4l2Format| modes.iter().filter(move |mode| mode.format == format).find(fits);
     match format {
         Some(format) => of(format),
-        None => V4l2Format::ALL.iter().filter(|(_, format)| *format != V4l2Format::Z16).find_map(|(_, each)| of(*each)),
+        None => V4l2Format::OF_COLOR.iter().find_map(|(_, each)| of(*each)),
     }
+}
+
+/// Bytes a second that USB carries to one camera, by the speed that sysfs tells: the largest isochronous transfer of an endpoint.
+///
+/// Source: USB 2.0 section 5.6.3 (full speed 1023 bytes a millisecond, high speed 3072 bytes in 125 us), USB 3.2 section 8.12.6
+/// (48 KiB in 125 us; twice that at 10 Gbit/s).
+pub(super) fn usb_bytes_per_sec(mbits: f64) -> f64 {
+    match mbits {
+        mbits if mbits < 480.0 => 1023.0 * 1e3,
+        mbits if mbits < 5000.0 => 3072.0 * 8e3,
+        mbits if mbits < 10_000.0 => 49_152.0 * 8e3,
+        _ => 98_304.0 * 8e3,
+    }
+}
+
+/// What of some modes takes more than so many bytes a second: the slowest rate of each that does, for people.
+pub(super) fn beyond(modes: &[Mode], bytes_per_sec: f64) -> Vec<String> {
+    let too_fast = |mode: &Mode| {
+        let [width, height] = mode.sizes.most();
+        let needs = |rate_hz: f64| mode.format.bytes_per_sec([width, height], rate_hz);
+        let rates: &[f64] = match &mode.rates {
+            Rates::Untold => &[],
+            Rates::List(rates) => rates,
+            Rates::Range { most_hz, .. } => std::slice::from_ref(most_hz),
+        };
+        let slowest = rates.iter().copied().filter(|hz| needs(*hz) > Some(bytes_per_sec)).fold(f64::INFINITY, f64::min);
+        let megabytes = needs(slowest).filter(|needs| needs.is_finite())? * 1e-6;
+        Some(format!("{} {width}x{height} at {slowest:.0} Hz ({megabytes:.0} MB/s)", mode.format.name()))
+    };
+    modes.iter().filter_map(too_fast).collect()
 }
 
 /// Whether two rates, images a second, are one rate told in two ways.
@@ -219,40 +263,43 @@ pub(super) fn interval_of(rate_hz: f64) -> Fraction {
     }
 }
 
-impl fmt::Display for Mode {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} ", self.format.name())?;
-        match &self.sizes {
-            Sizes::One([width, height]) => write!(f, "{width}x{height}")?,
-            Sizes::Range { least: [w0, h0], most: [w1, h1], .. } => write!(f, "{w0}x{h0} to {w1}x{h1}")?,
-        }
-        let number = |hz: &f64| format!("{}", (hz * 100.0).round() / 100.0);
-        match &self.rates {
-            Rates::Untold => Ok(()),
-            Rates::List(rates) => write!(f, " at {} Hz", rates.iter().map(number).collect::<Vec<_>>().join(", ")),
-            Rates::Range { least_hz, most_hz } => write!(f, " at {} to {} Hz", number(least_hz), number(most_hz)),
-        }
-    }
+/// What some modes offer, for people: each format with its sizes and the highest rate at each.
+pub fn summary(modes: &[Mode]) -> String {
+    let size = |mode: &Mode| {
+        let sizes = match &mode.sizes {
+            Sizes::One([width, height]) => format!("{width}x{height}"),
+            Sizes::Range { least: [w0, h0], most: [w1, h1], .. } => format!("{w0}x{h0} to {w1}x{h1}"),
+        };
+        let most_hz = match &mode.rates {
+            Rates::Untold => return sizes,
+            Rates::List(rates) => rates.iter().copied().fold(0.0, f64::max),
+            Rates::Range { most_hz, .. } => *most_hz,
+        };
+        format!("{sizes} up to {} Hz", (most_hz * 100.0).round() / 100.0)
+    };
+    let of_format = |format: V4l2Format| {
+        let sizes: Vec<_> = modes.iter().filter(|mode| mode.format == format).map(size).collect();
+        (!sizes.is_empty()).then(|| format!("{}: {}", format.name(), sizes.join(", ")))
+    };
+    let formats = V4l2Format::OF_COLOR.iter().map(|(_, format)| *format).chain([V4l2Format::Z16]);
+    let all: Vec<_> = formats.filter_map(of_format).collect();
+    if all.is_empty() { "no format that is read here".to_owned() } else { all.join("; ") }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn mode(format: V4l2Format, size: [u32; 2], rates: &[f64]) -> Mode {
-        Mode { fourcc: 0, format, sizes: Sizes::One(size), rates: Rates::List(rates.to_vec()) }
-    }
-
     #[test]
     fn what_is_not_compressed_is_taken_where_it_is_fast_enough() {
         use V4l2Format::{Grey, Mjpeg, Yuyv, Z16};
         // As a USB 2 webcam offers them.
         let modes = [
-            mode(Mjpeg, [1280, 720], &[30.0, 15.0]),
-            mode(Yuyv, [640, 480], &[30.0]),
-            mode(Yuyv, [1280, 720], &[10.0]),
-            mode(Z16, [848, 480], &[30.0]),
-            mode(Grey, [848, 480], &[30.0]),
+            Mode::new(Mjpeg, [1280, 720], &[30.0, 15.0]),
+            Mode::new(Yuyv, [640, 480], &[30.0]),
+            Mode::new(Yuyv, [1280, 720], &[10.0]),
+            Mode::new(Z16, [848, 480], &[30.0]),
+            Mode::new(Grey, [848, 480], &[30.0]),
         ];
         let taken = |format, size, rate_hz| choose(&modes, format, size, rate_hz).map(|mode| mode.format);
         assert_eq!(taken(None, [640, 480], 30.0), Some(Yuyv));
@@ -300,6 +347,14 @@ mod tests {
         let bytes = V4l2Format::Yuyv.bytes_per_sec([2560, 1440], 30.0).expect("not compressed");
         assert_eq!((bytes / 1e6).round(), 221.0);
         assert_eq!(V4l2Format::Mjpeg.bytes_per_sec([2560, 1440], 30.0), None);
+        let modes = [
+            Mode::new(V4l2Format::Yuyv, [640, 480], &[30.0, 15.0]),
+            Mode::new(V4l2Format::Yuyv, [2560, 1440], &[5.0, 30.0, 15.0]),
+            Mode::new(V4l2Format::Mjpeg, [2560, 1440], &[30.0]),
+        ];
+        assert_eq!(beyond(&modes, usb_bytes_per_sec(480.0)), ["yuyv 2560x1440 at 5 Hz (37 MB/s)"]);
+        assert_eq!(beyond(&modes, usb_bytes_per_sec(5000.0)), Vec::<String>::new());
+        assert_eq!(beyond(&modes, 200e6), ["yuyv 2560x1440 at 30 Hz (221 MB/s)"]);
     }
 
     #[test]
@@ -308,6 +363,20 @@ mod tests {
         assert_eq!(V4l2Format::from_fourcc(0x5659_5559), Some(V4l2Format::Yuyv));
         assert_eq!(V4l2Format::from_fourcc(0x2036_315a), Some(V4l2Format::Z16));
         assert_eq!(V4l2Format::from_fourcc(0), None);
-        assert_eq!(mode(V4l2Format::Nv12, [640, 480], &[30.0, 14.985]).to_string(), "nv12 640x480 at 30, 14.99 Hz");
+        for (_, format) in V4l2Format::OF_COLOR {
+            assert_eq!(V4l2Format::from_fourcc(format.fourcc()), Some(format));
+        }
+    }
+
+    #[test]
+    fn offers_are_told_by_format() {
+        let modes = [
+            Mode::new(V4l2Format::Mjpeg, [1280, 720], &[30.0, 15.0]),
+            Mode::new(V4l2Format::Yuyv, [640, 480], &[14.985, 29.97]),
+            Mode::new(V4l2Format::Yuyv, [1280, 720], &[10.0]),
+        ];
+        let told = "yuyv: 640x480 up to 29.97 Hz, 1280x720 up to 10 Hz; mjpeg: 1280x720 up to 30 Hz";
+        assert_eq!(summary(&modes), told);
+        assert_eq!(summary(&[]), "no format that is read here");
     }
 }

@@ -16,7 +16,7 @@ mod sequence;
 pub use camera::{Counts, V4l2Camera};
 pub use controls::Settings;
 pub use find::{Found, cameras};
-pub use format::{Mode, Rates, Sizes, V4l2Format};
+pub use format::{Mode, Rates, Sizes, V4l2Format, summary};
 pub use problem::Problem;
 
 use kinematics::Intrinsics;
@@ -30,7 +30,7 @@ pub struct Config {
     /// A path (best a link under `/dev/v4l`, whose name stays), a serial number on USB, or where it is plugged in as the
     /// kernel tells (`usb-0000:00:14.0-2`).
     pub device: String,
-    /// Pixel format; `None` takes the first that is offered at this size and rate, see [`V4l2Format::ALL`].
+    /// Pixel format; `None` takes the first that is offered at this size and rate, see [`V4l2Format::OF_COLOR`].
     pub format: Option<V4l2Format>,
     /// Lens and size of the images.
     pub intrinsics: Intrinsics,

@@ -34,12 +34,12 @@ pub enum Problem {
         path: PathBuf,
     },
     /// It does not offer what is asked for.
-    #[error("it does not offer {wanted}; it offers: {}", offered.join("; "))]
+    #[error("it does not offer {wanted}; it offers {offered}")]
     NoMode {
         /// Format, size and rate of the rig file.
         wanted: String,
         /// All that it has.
-        offered: Vec<String>,
+        offered: String,
     },
     /// It offers something, but does otherwise.
     #[error("asked for {wanted}, it gives {got}")]

@@ -1,5 +1,6 @@
 //! A V4L2 device that streams: from the node to stamped images.
 
+use super::abi::{FIELD_ANY, FIELD_NONE, PixFormat};
 use super::controls::{self, Applied};
 use super::device::{Device, Filled, Refused, Stream};
 use super::format::{self, Mode, V4l2Format};
@@ -14,8 +15,8 @@ use std::time::{Duration, Instant};
 
 /// Images that the device may fill while we copy one: a quarter of a second at 30 Hz.
 const N_BUFFERS: u32 = 8;
-/// A stamp further from now than this is of another clock, whatever its flag says.
-const MAX_STAMP_OFF_NANOS: u64 = 1_000_000_000;
+/// A stamp so long before the stream began, or after now, is of another clock, whatever its flag says.
+const MAX_STAMP_OFF_SECS: f64 = 1.0;
 /// Asking for the exposure of each image may take this share of the time between two.
 const MAX_ASKING_FRAC: f64 = 0.25;
 
@@ -30,6 +31,7 @@ pub(super) struct Running {
     bytes_per_line: usize,
     applied: Applied,
     sequence: Sequence,
+    began: Stamp,
     /// Lost and not told yet.
     n_untold: u64,
     n_images: u64,
@@ -69,14 +71,10 @@ impl Running {
         let format = mode.format.pixels(colors, config.metres_per_count.unwrap_or(0.0))?;
         controls::apply(&config.settings, &device).map_err(named)?;
         let wanted = wanted(config, Some(mode.format));
-        let bytes_per_sec = mode.format.bytes_per_sec(config.intrinsics.size_px, config.rate_hz);
+        let began = clock::now();
         let stream = device.stream(N_BUFFERS).map_err(|refused| {
-            named(match refused {
-                Refused::Begin(Errno::NOSPC) => Problem::Bandwidth { mode: wanted.clone(), bytes_per_sec },
-                Refused::Buffers(Errno::BUSY) | Refused::Begin(Errno::BUSY) => Problem::Busy { path: path.to_owned() },
-                Refused::Buffers(error) => Problem::Refused { what: "share memory for images", source: error.into() },
-                Refused::Begin(error) => Problem::Refused { what: "begin its stream", source: error.into() },
-            })
+            let bytes_per_sec = mode.format.bytes_per_sec(config.intrinsics.size_px, config.rate_hz);
+            named(problem_of(refused, path, wanted.clone(), bytes_per_sec))
         })?;
         let applied = controls::confirm(&config.settings, stream.device()).map_err(named)?;
         Ok(Self {
@@ -88,6 +86,7 @@ impl Running {
             bytes_per_line: pix.bytes_per_line as usize,
             applied,
             sequence: Sequence::default(),
+            began,
             n_untold: 0,
             n_images: 0,
             n_damaged: 0,
@@ -193,8 +192,10 @@ impl Running {
     /// The device's stamp where it is of our clock, else now. `stamp_to_mid_exposure_millis` of the rig file says what it means.
     fn stamp_of(&mut self, filled: &Filled) -> Stamp {
         let now = clock::now();
-        if filled.is_monotonic && filled.stamp_nanos.abs_diff(now.0) < MAX_STAMP_OFF_NANOS {
-            return Stamp(filled.stamp_nanos);
+        let stamp = Stamp(filled.stamp_nanos);
+        let ours = self.began.plus_secs(-MAX_STAMP_OFF_SECS)..now.plus_secs(MAX_STAMP_OFF_SECS);
+        if filled.is_monotonic && ours.contains(&stamp) {
+            return stamp;
         }
         if !std::mem::replace(&mut self.clock_warned, true) {
             log::warn!(
@@ -221,6 +222,16 @@ impl Running {
     }
 }
 
+/// Why a stream did not begin; `ENOSPC` is how the kernel says that USB has no bandwidth left (`usb_submit_urb`).
+fn problem_of(refused: Refused, path: &Path, mode: String, bytes_per_sec: Option<f64>) -> Problem {
+    match refused {
+        Refused::Begin(Errno::NOSPC) => Problem::Bandwidth { mode, bytes_per_sec },
+        Refused::Buffers(Errno::BUSY) | Refused::Begin(Errno::BUSY) => Problem::Busy { path: path.to_owned() },
+        Refused::Buffers(error) => Problem::Refused { what: "share memory for images", source: error.into() },
+        Refused::Begin(error) => Problem::Refused { what: "begin its stream", source: error.into() },
+    }
+}
+
 /// A device that streamed and fails is unplugged, or as good as that.
 fn lost(error: Errno) -> Problem {
     Problem::Unplugged { source: error.into() }
@@ -239,13 +250,11 @@ fn open(config: &Config, path: &Path) -> Result<Device, Problem> {
 }
 
 /// Chooses the mode and sets it; the device must do exactly that.
-fn set_mode(config: &Config, path: &Path, device: &Device) -> Result<(Mode, super::abi::PixFormat), Problem> {
+fn set_mode(config: &Config, path: &Path, device: &Device) -> Result<(Mode, PixFormat), Problem> {
     let modes = find::modes(device);
     let (size_px, rate_hz) = (config.intrinsics.size_px, config.rate_hz);
-    let mode = format::choose(&modes, config.format, size_px, rate_hz).ok_or_else(|| Problem::NoMode {
-        wanted: wanted(config, config.format),
-        offered: modes.iter().map(ToString::to_string).collect(),
-    })?;
+    let mode = format::choose(&modes, config.format, size_px, rate_hz)
+        .ok_or_else(|| Problem::NoMode { wanted: wanted(config, config.format), offered: format::summary(&modes) })?;
     let refused = |error| match error {
         Errno::BUSY => Problem::Busy { path: path.to_owned() },
         error => Problem::Refused { what: "take the format", source: std::io::Error::from(error) },
@@ -259,6 +268,9 @@ fn set_mode(config: &Config, path: &Path, device: &Device) -> Result<(Mode, supe
         let got = format!("{format} {}x{}{rate}", pix.width, pix.height);
         return Err(Problem::OtherMode { wanted: wanted(config, Some(mode.format)), got });
     }
+    if ![FIELD_ANY, FIELD_NONE].contains(&pix.field) {
+        log::warn!("camera {:?}: it sends every other row at another time (interlaced)", config.name);
+    }
     if got_hz.is_none() {
         log::warn!("camera {:?}: its rate cannot be set; rate_hz of the rig file is taken for it", config.name);
     }
@@ -268,4 +280,22 @@ fn set_mode(config: &Config, path: &Path, device: &Device) -> Result<(Mode, supe
 fn wanted(config: &Config, format: Option<V4l2Format>) -> String {
     let [width, height] = config.intrinsics.size_px;
     format!("{} {width}x{height} at {} Hz", format.map_or("color", V4l2Format::name), config.rate_hz)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stream_without_bandwidth_is_told_with_what_to_do() {
+        let told =
+            |refused, mode: &str, bytes| problem_of(refused, Path::new("/dev/video0"), mode.into(), bytes).to_string();
+        let full = told(Refused::Begin(Errno::NOSPC), "yuyv 2560x1440 at 30 Hz", Some(221.2e6));
+        assert!(full.starts_with("USB has no bandwidth left for yuyv 2560x1440 at 30 Hz (221 MB/s): "), "{full}");
+        assert!(full.contains("mjpeg") && full.contains("another USB controller"), "{full}");
+        let compressed = told(Refused::Begin(Errno::NOSPC), "mjpeg 2560x1440 at 30 Hz", None);
+        assert!(compressed.starts_with("USB has no bandwidth left for mjpeg 2560x1440 at 30 Hz: "), "{compressed}");
+        assert!(told(Refused::Buffers(Errno::BUSY), "", None).contains("fuser -v /dev/video0"));
+        assert!(told(Refused::Begin(Errno::IO), "", None).starts_with("it refuses to begin its stream: "));
+    }
 }
