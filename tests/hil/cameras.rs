@@ -16,6 +16,10 @@ const GRABBER: &str = "platform:vivid-001";
 /// Controls by which vivid injects faults (`vivid-ctrls.c`): percent of the images that it drops; a pulled cable.
 const DROP_PERCENT: u32 = 0x00f0_f040;
 const DISCONNECT: u32 = 0x00f0_f041;
+/// The next image is damaged; the next stream does not begin; the stream that runs breaks down.
+const DAMAGE: u32 = 0x00f0_f042;
+const REFUSE_STREAM: u32 = 0x00f0_f045;
+const BREAK_STREAM: u32 = 0x00f0_f046;
 /// Gain and brightness by the kernel's numbers, and values that are not the defaults.
 const GAIN: u32 = 0x0098_0913;
 const BRIGHTNESS: u32 = 0x0098_0900;
@@ -213,6 +217,32 @@ fn a_camera_that_stays_away_is_an_error_after_its_time() {
     println!("stays away: {error}");
     assert!(error.contains("\"front\"") && error.contains("not there again after"), "{error}");
     assert!(began.elapsed() >= wait && began.elapsed() < 2 * wait, "{:?}", began.elapsed());
+}
+
+#[test]
+#[ignore = "runs in the virtual kernel"]
+fn damaged_images_and_broken_streams_are_counted_and_mended() {
+    let rate_hz = 25.0;
+    let mut camera = V4l2Camera::open(config(WEBCAM, [640, 360], rate_hz)).expect("vivid opens");
+    let mut seen = Seen::during(&mut camera, 0.3);
+    for _ in 0..3 {
+        v4l2::set_control(&node(WEBCAM), DAMAGE, 1).expect("vivid injects faults");
+        seen.images.extend(Seen::during(&mut camera, 0.3).images);
+    }
+    let (_, lost) = seen.report("three damaged images", rate_hz);
+    assert_eq!((camera.counts().n_damaged, lost), (3, 3));
+    assert_eq!(camera.counts().n_reconnections, 0, "a damaged image is no reason to begin anew");
+
+    v4l2::set_control(&node(WEBCAM), BREAK_STREAM, 1).expect("vivid injects faults");
+    let (_, took) = back_after(&mut camera, Instant::now());
+    println!("a stream that broke down: images again after {took:.0?}");
+    assert!(took < Duration::from_secs(1) && camera.counts().n_reconnections == 1);
+    drop(camera);
+
+    v4l2::set_control(&node(WEBCAM), REFUSE_STREAM, 1).expect("vivid injects faults");
+    let refused = V4l2Camera::open(config(WEBCAM, [640, 360], rate_hz)).expect_err("vivid refuses").to_string();
+    println!("{refused}");
+    assert!(refused.contains("\"front\": it refuses to begin its stream"), "{refused}");
 }
 
 #[test]
