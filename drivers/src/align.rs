@@ -17,7 +17,7 @@ pub struct DepthAlignment {
     /// Rays of the pixels' corners, `z` = 1 in the depth camera, in the axes of the colour camera: `[height + 1, width + 1]`.
     corners: [Vec<f32>; 3],
     /// The depth camera in the frame of the colour camera, metres.
-    depth_in_color: [f32; 3],
+    depth_in_color: [f64; 3],
 }
 
 /// [`Intrinsics`] in f32.
@@ -38,21 +38,39 @@ enum ColorLens {
     KannalaBrandt([f32; 4]),
 }
 
-/// First and last column and row that each pixel of one row of depth covers, before they are cut to the image.
+/// First and last column and row that each pixel of one row of depth covers, cut to the image; counted from 1, so that 0 is
+/// before the image. Where a first one is behind a last one nothing is covered.
 struct Covered {
-    first: [Vec<i32>; 2],
-    last: [Vec<i32>; 2],
+    first: [Vec<u16>; 2],
+    last: [Vec<u16>; 2],
 }
 
-/// One corner of each pixel of one row of depth.
+/// Which corner of each pixel of one row of depth.
 #[derive(Clone, Copy)]
-struct Corners<'a> {
-    counts: &'a [u16],
-    metres_per_count: f32,
-    /// Place of the first one among all corners.
-    start: usize,
+enum Corner {
+    /// Left and upper: what is not seen lies behind the image.
+    First,
+    /// Right and lower: what is not seen lies before the image.
+    Last,
+}
+
+/// From a ray to a position in the colour image.
+struct View {
+    /// The depth camera in the frame of the colour camera, in units of one count.
+    depth_in_color: [f32; 3],
+    focal_px: [f32; 2],
+    principal_px: [f32; 2],
     /// Position that stands for what the colour camera does not see.
     unseen_px: f32,
+}
+
+/// Room for the work on one row of depth.
+struct Row {
+    /// Depth along z, in units of one count.
+    counts: Vec<f32>,
+    /// Columns and rows in the colour image, pixels.
+    positions_px: [Vec<f32>; 2],
+    covered: Covered,
 }
 
 impl DepthAlignment {
@@ -66,12 +84,11 @@ impl DepthAlignment {
                 None => [f64::NAN; 3],
             })
             .collect();
-        let translation: [f64; 3] = color_from_depth.translation.vector.into();
         Self {
             depth_px: depth.size_px,
             color: ColorCamera::new(color),
             corners: std::array::from_fn(|axis| rays.iter().map(|ray| narrow(ray[axis])).collect()),
-            depth_in_color: translation.map(narrow),
+            depth_in_color: color_from_depth.translation.vector.into(),
         }
     }
 
@@ -93,94 +110,146 @@ impl DepthAlignment {
         }
         let counts: Vec<u16> =
             depth.raw_bytes()?.as_chunks::<2>().0.iter().map(|&bytes| u16::from_le_bytes(bytes)).collect();
-        let aligned = self.align_counts(&counts, narrow(metres_per_count));
-        let data = aligned.iter().flat_map(|count| count.to_le_bytes()).collect();
-        Ok(Image { size_px: self.color.size_px, data, ..depth.clone() })
+        let aligned = self.align_counts(&counts, metres_per_count);
+        let mut data = vec![0; 2 * aligned.len()];
+        for (bytes, less_one) in data.as_chunks_mut::<2>().0.iter_mut().zip(aligned) {
+            let count = less_one.wrapping_add(1);
+            // The largest count says nothing either.
+            *bytes = if count == u16::MAX { [0; 2] } else { count.to_le_bytes() };
+        }
+        Ok(Image { size_px: self.color.size_px, data: data.into(), ..depth.clone() })
     }
 
-    fn align_counts(&self, counts: &[u16], metres_per_count: f32) -> Vec<u16> {
-        const NOTHING: u16 = u16::MAX; // So that the nearest is the smallest.
+    /// The nearest count less one of each colour pixel: so 0, which says nothing, is the largest number and never stays.
+    fn align_counts(&self, counts: &[u16], metres_per_count: f64) -> Vec<u16> {
         let [width, height] = self.color.size_px.map(|side| side as usize);
-        let mut aligned = vec![NOTHING; width * height];
+        let mut aligned = vec![u16::MAX; width * height];
         let depth_width = self.depth_px[0] as usize;
-        let column = || vec![0; depth_width];
-        let mut covered = Covered { first: [column(), column()], last: [column(), column()] };
+        let cells = || [vec![0; depth_width], vec![0; depth_width]];
+        let mut work = Row {
+            counts: vec![0.0; depth_width],
+            positions_px: [vec![0.0; depth_width], vec![0.0; depth_width]],
+            covered: Covered { first: cells(), last: cells() },
+        };
+        // In units of one count, so that counts need no factor.
+        let depth_in_color = self.depth_in_color.map(|metres| narrow(metres / metres_per_count));
         for (row_ix, row) in counts.chunks_exact(depth_width.max(1)).enumerate() {
+            for (number, count) in work.counts.iter_mut().zip(row) {
+                *number = f32::from(*count);
+            }
             let first_corner = row_ix * (depth_width + 1);
-            let first = Corners { counts: row, metres_per_count, start: first_corner, unseen_px: f32::MAX };
+            self.project(&mut work, depth_in_color, first_corner, Corner::First);
             // The opposite corners lie one row and one column on.
-            let last = Corners { start: first_corner + depth_width + 2, unseen_px: -1.0, ..first };
-            self.project(&first, &mut covered.first);
-            self.project(&last, &mut covered.last);
-            cover(&mut aligned, [width, height], row, &covered);
-        }
-        for count in &mut aligned {
-            *count = if *count == NOTHING { 0 } else { *count };
+            self.project(&mut work, depth_in_color, first_corner + depth_width + 2, Corner::Last);
+            cover(&mut aligned, width, row, &work.covered);
         }
         aligned
     }
 
-    /// Colour pixels, column and row, where the corners are seen.
-    fn project(&self, corners: &Corners<'_>, cells: &mut [Vec<i32>; 2]) {
+    /// Colour pixels, column and row, where the corners of a row are seen; `start` is the place of the first among all.
+    fn project(&self, work: &mut Row, depth_in_color: [f32; 3], start: usize, corner: Corner) {
+        let view = View {
+            depth_in_color,
+            focal_px: self.color.focal_px,
+            principal_px: self.color.principal_px,
+            unseen_px: match corner {
+                Corner::First => f32::MAX,
+                Corner::Last => -1.0,
+            },
+        };
+        let reach2 = self.color.reach2;
+        let [columns, rows] = &mut work.positions_px;
+        let counts = &work.counts;
+        let rays = [0, 1, 2].map(|axis| &self.corners[axis][start..]);
         match self.color.lens {
-            ColorLens::Pinhole => self.project_by(corners, cells, |x, y, _| [x, y]),
-            ColorLens::BrownConrady(k) => self.project_by(corners, cells, |x, y, r2| brown_conrady(k, x, y, r2)),
-            ColorLens::KannalaBrandt(k) => self.project_by(corners, cells, |x, y, r2| kannala_brandt(k, x, y, r2)),
+            ColorLens::Pinhole => project_by(columns, rows, counts, rays, &view, |x, y| ([x, y], true)),
+            ColorLens::BrownConrady(k) => project_by(columns, rows, counts, rays, &view, |x, y| {
+                let r2 = x * x + y * y;
+                (brown_conrady(k, x, y, r2), r2 <= reach2)
+            }),
+            ColorLens::KannalaBrandt(k) => project_by(columns, rows, counts, rays, &view, |x, y| {
+                let r2 = x * x + y * y;
+                (kannala_brandt(k, x, y, r2), r2 <= reach2)
+            }),
         }
-    }
-
-    /// [`Self::project`] with one lens, free of branches so that the compiler makes vector code of it.
-    #[inline(always)]
-    fn project_by(
-        &self,
-        corners: &Corners<'_>,
-        [columns, rows]: &mut [Vec<i32>; 2],
-        distort: impl Fn(f32, f32, f32) -> [f32; 2],
-    ) {
-        let &Corners { counts, metres_per_count, start, unseen_px } = corners;
-        let n = counts.len();
-        let [xs, ys, zs] = [0, 1, 2].map(|axis| &self.corners[axis][start..][..n]);
-        let (columns, rows) = (&mut columns[..n], &mut rows[..n]);
-        let [tx, ty, tz] = self.depth_in_color;
-        let ([fx, fy], [cx, cy]) = (self.color.focal_px, self.color.principal_px);
-        let [width, height] = self.color.size_px.map(|side| side as f32);
-        for ix in 0..n {
-            let depth_m = f32::from(counts[ix]) * metres_per_count;
-            let z = depth_m * zs[ix] + tz;
-            let (x, y) = ((depth_m * xs[ix] + tx) / z, (depth_m * ys[ix] + ty) / z);
-            let r2 = x * x + y * y;
-            let [distorted_x, distorted_y] = distort(x, y, r2);
-            let is_seen = (z > 0.0) & (r2 <= self.color.reach2);
-            columns[ix] = cell(if is_seen { distorted_x * fx + cx } else { unseen_px }, width);
-            rows[ix] = cell(if is_seen { distorted_y * fy + cy } else { unseen_px }, height);
+        let cells = match corner {
+            Corner::First => &mut work.covered.first,
+            Corner::Last => &mut work.covered.last,
+        };
+        for ((cells, positions_px), side) in cells.iter_mut().zip(&work.positions_px).zip(self.color.size_px) {
+            number(cells, positions_px, side, corner);
         }
     }
 }
 
-/// Number of the pixel at a position, -1 for all before the image and `side` for all behind it.
+/// Positions in the colour image, columns and rows, by a lens that says where a point of the plane `z` = 1 lies and whether it is
+/// in use there; free of branches, and each list an argument of its own, so that the compiler makes vector code of it.
 #[inline(always)]
-#[expect(clippy::cast_possible_truncation, reason = "cut to the image before")]
-fn cell(position_px: f32, side: f32) -> i32 {
-    // Casts round towards zero, and positive numbers have nothing else to round to: no call of `floor`.
-    (position_px.max(-1.0).min(side) + 1.0) as i32 - 1
+fn project_by(
+    columns: &mut [f32],
+    rows: &mut [f32],
+    counts: &[f32],
+    [xs, ys, zs]: [&[f32]; 3],
+    view: &View,
+    distort: impl Fn(f32, f32) -> ([f32; 2], bool),
+) {
+    let n = counts.len();
+    let (xs, ys, zs, columns, rows) = (&xs[..n], &ys[..n], &zs[..n], &mut columns[..n], &mut rows[..n]);
+    let View { depth_in_color: [tx, ty, tz], focal_px: [fx, fy], principal_px: [cx, cy], unseen_px } = *view;
+    for ix in 0..n {
+        let z = counts[ix] * zs[ix] + tz;
+        let inverse = 1.0 / z;
+        let (x, y) = ((counts[ix] * xs[ix] + tx) * inverse, (counts[ix] * ys[ix] + ty) * inverse);
+        let ([distorted_x, distorted_y], is_in_use) = distort(x, y);
+        // The column alone keeps a pixel away.
+        columns[ix] = if (z > 0.0) & is_in_use { distorted_x * fx + cx } else { unseen_px };
+        rows[ix] = distorted_y * fy + cy;
+    }
 }
 
-/// Puts the counts of one row of depth where they are nearer than what is there.
-fn cover(aligned: &mut [u16], [width, height]: [usize; 2], row: &[u16], covered: &Covered) {
-    let last = |side: usize| i32::try_from(side).unwrap_or(i32::MAX) - 1;
-    let (last_column, last_row) = (last(width), last(height));
+/// Numbers of the pixels at some positions, from 1 on, cut to the image and one number behind it ([`Corner::First`]) or before it.
+#[expect(clippy::cast_possible_truncation, reason = "the low 16 bits are the number")]
+fn number(numbers: &mut [u16], positions_px: &[f32], side: u32, corner: Corner) {
+    // Numbers have 16 bits: larger images get no depth beyond.
+    let side = side.min(u32::from(u16::MAX) - 1) as f32;
+    let (least, most) = match corner {
+        Corner::First => (1.0, side + 1.0),
+        Corner::Last => (0.0, side),
+    };
+    // From here on floats have no fractions, and their low bits count.
+    const WHOLE: f32 = 8_388_608.0;
+    for (number, position_px) in numbers.iter_mut().zip(positions_px) {
+        // Comparisons as vector instructions make them, which `max` and `min` are not for what is no number.
+        let from_one = position_px + 1.0;
+        let from_one = if from_one > least { from_one } else { least };
+        let from_one = if from_one < most { from_one } else { most };
+        let nearest = (from_one + WHOLE) - WHOLE;
+        let below = nearest - if nearest > from_one { 1.0 } else { 0.0 };
+        *number = (below + WHOLE).to_bits() as u16;
+    }
+}
+
+/// Puts the counts of one row of depth, less one, where they are nearer than what is there.
+fn cover(aligned: &mut [u16], width: usize, row: &[u16], covered: &Covered) {
     let Covered { first: [left, top], last: [right, bottom] } = covered;
     let corners = left.iter().zip(top).zip(right.iter().zip(bottom));
     for (&count, ((&left, &top), (&right, &bottom))) in row.iter().zip(corners) {
-        let (left, right) = (left.max(0), right.min(last_column));
-        let (top, bottom) = (top.max(0), bottom.min(last_row));
-        if count == 0 || left > right || top > bottom {
+        if left > right || top > bottom {
             continue;
         }
-        let [left, right, top, bottom] = [left, right, top, bottom].map(i32::cast_unsigned).map(|cell| cell as usize);
-        for line in aligned[top * width..(bottom + 1) * width].chunks_exact_mut(width) {
-            for nearest in &mut line[left..=right] {
-                *nearest = (*nearest).min(count);
+        let less_one = count.wrapping_sub(1);
+        // First ones are 1 at least.
+        let [left, right, top, bottom] = [left, right, top, bottom].map(|number| usize::from(number) - 1);
+        for line in top..=bottom {
+            let line = &mut aligned[line * width..][..width];
+            if right - left < 3 {
+                // Most squares are this small. All three are written, the same or not: a wrong guess of how many there are
+                // costs more.
+                let columns = [left, (left + 1).min(right), right];
+                let nearest = columns.map(|column| line[column].min(less_one));
+                columns.into_iter().zip(nearest).for_each(|(column, nearest)| line[column] = nearest);
+            } else {
+                line[left..=right].iter_mut().for_each(|nearest| *nearest = less_one.min(*nearest));
             }
         }
     }

@@ -48,6 +48,12 @@ enum Link {
 impl V4l2Camera {
     /// Opens a camera, sets it up as the rig file says, reads that back, and starts its stream.
     pub fn open(config: Config) -> Result<Self, Error> {
+        if config.device.starts_with("/dev/video") {
+            let Config { name, device, .. } = &config;
+            log::warn!(
+                "camera {name:?}: {device} may be another camera tomorrow; `fieldrig devices` prints a name that stays"
+            );
+        }
         let running = Running::start(&config)?;
         log::info!("camera {:?}: {}", config.name, running.describe());
         Ok(Self { config, link: Link::Up(Box::new(running)), counts: Counts::default(), last: None })

@@ -46,6 +46,8 @@ impl Found {
 #[derive(Clone, Debug, PartialEq)]
 struct Node {
     path: PathBuf,
+    /// Its USB device in sysfs; a camera's nodes share it.
+    usb: Option<PathBuf>,
     serial: Option<String>,
     usb_mbits: Option<f64>,
 }
@@ -94,8 +96,20 @@ pub(super) fn candidates(device: &str) -> Result<Vec<PathBuf>, Problem> {
         Device::open(&node.path).and_then(|open| open.identity()).is_ok_and(|identity| identity.bus == device)
     };
     let is_meant = |node: &Node| node.serial.as_deref() == Some(device) || sits_there(node);
-    let found: Vec<_> = nodes(Path::new("/")).into_iter().filter(is_meant).map(|node| node.path).collect();
-    if found.is_empty() { Err(Problem::NoDevice { device: device.to_owned() }) } else { Ok(found) }
+    let found = nodes(Path::new("/")).into_iter().filter(is_meant).collect();
+    one_camera(device, found)
+}
+
+/// The paths of nodes once they are known to be of one camera: makers give serial numbers twice.
+fn one_camera(device: &str, found: Vec<Node>) -> Result<Vec<PathBuf>, Problem> {
+    let device = device.to_owned();
+    let is_one = found.windows(2).all(|pair| pair[0].usb == pair[1].usb);
+    let paths: Vec<_> = found.into_iter().map(|node| node.path).collect();
+    match paths.len() {
+        0 => Err(Problem::NoDevice { device }),
+        _ if !is_one => Err(Problem::Ambiguous { device, nodes: paths }),
+        _ => Ok(paths),
+    }
 }
 
 /// Every video node that sysfs knows, in the order of their numbers.
@@ -121,6 +135,7 @@ fn nodes(root: &Path) -> Vec<Node> {
                 path: root.join("dev").join(&name),
                 serial: attribute("serial"),
                 usb_mbits: attribute("speed").and_then(|speed| speed.parse().ok()),
+                usb,
             }
         })
         .collect()
@@ -179,8 +194,13 @@ mod tests {
         symlink("../../video9", root.join("dev/v4l/by-path/platform")).expect("link");
         let found = nodes(root);
         let wanted = [
-            Node { path: root.join("dev/video9"), serial: None, usb_mbits: None },
-            Node { path: node.clone(), serial: Some("A1B2".into()), usb_mbits: Some(480.0) },
+            Node { path: root.join("dev/video9"), usb: None, serial: None, usb_mbits: None },
+            Node {
+                path: node.clone(),
+                usb: Some(usb.canonicalize().expect("it is there")),
+                serial: Some("A1B2".into()),
+                usb_mbits: Some(480.0),
+            },
         ];
         assert_eq!(found, wanted);
         assert_eq!(links_to(root, &node), [root.join("dev/v4l/by-id/usb-A1B2"), root.join("dev/v4l/by-path/pci-2")]);

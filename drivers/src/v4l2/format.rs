@@ -212,6 +212,11 @@ pub(super) fn choose(modes: &[Mode], format: Option<V4l2Format>, size_px: [u32; 
     }
 }
 
+/// Place of a format in the order in which they are preferred; depth, which is asked for by name, comes last.
+pub(super) fn rank(format: V4l2Format) -> usize {
+    V4l2Format::OF_COLOR.iter().position(|(_, each)| *each == format).unwrap_or(V4l2Format::OF_COLOR.len())
+}
+
 /// Bytes a second that USB carries to one camera, by the speed that sysfs tells: the largest isochronous transfer of an endpoint.
 ///
 /// Source: USB 2.0 section 5.6.3 (full speed 1023 bytes a millisecond, high speed 3072 bytes in 125 us), USB 3.2 section 8.12.6

@@ -13,6 +13,14 @@ pub enum Problem {
         /// Path, serial number or place of the rig file.
         device: String,
     },
+    /// Several cameras go by this name.
+    #[error("several cameras go by {device:?} ({nodes:?}): name the port instead, by a link of /dev/v4l/by-path")]
+    Ambiguous {
+        /// Serial number or place of the rig file.
+        device: String,
+        /// Their nodes.
+        nodes: Vec<PathBuf>,
+    },
     /// The node cannot be opened.
     #[error("cannot open {path:?}: {source}{}", if source.kind() == std::io::ErrorKind::PermissionDenied {
         "; run `sudo usermod -aG video $USER`, then log in again"

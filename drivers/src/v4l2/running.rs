@@ -44,15 +44,17 @@ impl Running {
     /// Finds the device of a config and starts it.
     pub(super) fn start(config: &Config) -> Result<Self, Error> {
         let named = |problem| Error::V4l2 { camera: config.name.clone(), problem: Box::new(problem) };
-        // A camera has several nodes under one serial number: the first that can do what is asked for is meant.
-        let mut first_error = None;
-        for path in find::candidates(&config.device).map_err(named)? {
-            match Self::start_node(config, &path) {
-                Ok(running) => return Ok(running),
-                Err(error) => first_error = first_error.or(Some(error)),
-            }
+        let candidates = find::candidates(&config.device).map_err(named)?;
+        // A depth camera has nodes for color, infrared and depth under one serial number: the best that fits is meant.
+        let rank = |path: &&PathBuf| {
+            let modes = open(config, path).map(|device| find::modes(&device)).unwrap_or_default();
+            let mode = format::choose(&modes, config.format, config.intrinsics.size_px, config.rate_hz);
+            mode.map_or(usize::MAX, |mode| format::rank(mode.format))
+        };
+        match candidates.iter().min_by_key(rank) {
+            Some(path) => Self::start_node(config, path),
+            None => Err(named(Problem::NoDevice { device: config.device.clone() })),
         }
-        Err(first_error.unwrap_or_else(|| named(Problem::NoDevice { device: config.device.clone() })))
     }
 
     fn start_node(config: &Config, path: &Path) -> Result<Self, Error> {
