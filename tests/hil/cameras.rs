@@ -221,6 +221,40 @@ fn a_camera_that_stays_away_is_an_error_after_its_time() {
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
+fn a_camera_that_falls_silent_is_begun_anew_and_then_given_up() {
+    let wait = Duration::from_secs(5);
+    let mut camera =
+        V4l2Camera::open(Config { reconnect_for: wait, ..config(WEBCAM, [320, 180], 25.0) }).expect("vivid opens");
+    Seen::during(&mut camera, 0.2);
+    let drop_all = |percent| v4l2::set_control(&node(WEBCAM), DROP_PERCENT, percent).expect("vivid injects faults");
+    // Silent for three seconds: begun anew after two, and there again.
+    drop_all(100);
+    let began = Instant::now();
+    while began.elapsed() < Duration::from_secs(3) {
+        let quiet = camera.next_image(Duration::from_millis(100));
+        assert!(matches!(quiet, Ok(_) | Err(Error::NoImage { .. } | Error::Reconnecting { .. })), "{quiet:?}");
+    }
+    drop_all(0);
+    let (image, _) = back_after(&mut camera, Instant::now());
+    println!("silent for 3 s: begun anew {} times, {} images lost", camera.counts().n_reconnections, image.n_skipped);
+    assert_eq!(camera.counts().n_reconnections, 1);
+    assert!((70..=80).contains(&image.n_skipped), "{} images lost in 3 s at 25 Hz", image.n_skipped);
+    // Silent for good: opened again and again, and given up all the same.
+    drop_all(100);
+    let began = Instant::now();
+    let error = loop {
+        match camera.next_image(Duration::from_millis(100)) {
+            Ok(_) | Err(Error::NoImage { .. } | Error::Reconnecting { .. }) => assert!(began.elapsed() < 3 * wait),
+            Err(error) => break error.to_string(),
+        }
+    };
+    drop_all(0);
+    println!("silent for good: {error}");
+    assert!(error.contains("not there again after") && error.contains("it sent no whole image for"), "{error}");
+}
+
+#[test]
+#[ignore = "runs in the virtual kernel"]
 fn damaged_images_and_broken_streams_are_counted_and_mended() {
     let rate_hz = 25.0;
     let mut camera = V4l2Camera::open(config(WEBCAM, [640, 360], rate_hz)).expect("vivid opens");

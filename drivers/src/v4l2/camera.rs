@@ -24,6 +24,15 @@ pub struct V4l2Camera {
     counts: Counts,
     /// Stamp of the last image, across reconnections.
     last: Option<Stamp>,
+    /// Set from a loss to the next image.
+    outage: Option<Outage>,
+}
+
+/// A time without images.
+#[derive(Clone, Copy, Debug)]
+struct Outage {
+    since: Instant,
+    n_tries: u32,
 }
 
 /// What became of the camera since it was opened.
@@ -42,7 +51,7 @@ pub struct Counts {
 #[derive(Debug)]
 enum Link {
     Up(Box<Running>),
-    Down { since: Instant, last_try: Instant, n_tries: u32, why: Problem },
+    Down { last_try: Instant },
 }
 
 impl V4l2Camera {
@@ -56,7 +65,7 @@ impl V4l2Camera {
         }
         let running = Running::start(&config)?;
         log::info!("camera {:?}: {}", config.name, running.describe());
-        Ok(Self { config, link: Link::Up(Box::new(running)), counts: Counts::default(), last: None })
+        Ok(Self { config, link: Link::Up(Box::new(running)), counts: Counts::default(), last: None, outage: None })
     }
 
     /// What became of it so far.
@@ -79,74 +88,82 @@ impl V4l2Camera {
         self.counts.n_damaged += running.n_damaged() - n_damaged;
         let image = match image {
             Ok(image) => image,
-            Err(problem) => {
-                self.lose(problem);
-                return Ok(None);
-            }
+            Err(problem) => return self.lose(problem).map(|()| None),
         };
         let waited = running.silent_for();
         if image.is_none() && waited > MAX_SILENCE.max(Duration::from_secs_f64(MAX_SILENT_IMAGES / self.config.rate_hz))
         {
-            self.lose(Problem::Silent { waited });
+            self.lose(Problem::Silent { waited })?;
         }
         Ok(image.map(|image| self.count(image)))
     }
 
     fn count(&mut self, mut image: Image) -> Image {
-        if self.counts.n_images > 0 && image.n_skipped == 0 && self.is_first_again() {
-            image.n_skipped = self.last.map_or(0, |last| n_between(last, image.stamp, self.config.rate_hz));
+        if self.is_first_again() {
+            let by_time = self.last.map_or(0, |last| n_between(last, image.stamp, self.config.rate_hz));
+            image.n_skipped = image.n_skipped.max(by_time);
         }
         self.last = Some(image.stamp);
+        self.outage = None;
         self.counts.n_images += 1;
         self.counts.n_skipped += image.n_skipped;
         image
     }
 
-    /// Whether the image in hand is the first since the camera was found again.
+    /// Whether the image in hand is the first since the camera was opened, for the first time or again.
     fn is_first_again(&self) -> bool {
         matches!(&self.link, Link::Up(running) if running.n_images() == 1)
     }
 
-    fn lose(&mut self, why: Problem) {
-        log::warn!("camera {:?}: {why}; looking for it for {:?}", self.config.name, self.config.reconnect_for);
+    /// Closes the device before it is looked for: a node in use keeps its number. Fails when it has been lost for too long: a camera
+    /// that can be opened and sends nothing is lost, too.
+    fn lose(&mut self, why: Problem) -> Result<(), Error> {
         let now = Instant::now();
-        // The device is closed before it is looked for: a node in use keeps its number.
-        self.link = Link::Down { since: now, last_try: now, n_tries: 0, why };
+        let outage = *self.outage.get_or_insert(Outage { since: now, n_tries: 0 });
+        self.link = Link::Down { last_try: now };
+        if outage.n_tries > 0 {
+            return self.give_up_if_late(outage, why);
+        }
+        log::warn!("camera {:?}: {why}; looking for it for {:?}", self.config.name, self.config.reconnect_for);
+        Ok(())
+    }
+
+    /// The error of a camera that was lost for longer than the rig file allows.
+    fn give_up_if_late(&self, Outage { since, n_tries }: Outage, why: Problem) -> Result<(), Error> {
+        let (camera, waited) = (self.config.name.clone(), since.elapsed());
+        if waited < self.config.reconnect_for {
+            log::debug!("camera {camera:?}: {why}");
+            return Ok(());
+        }
+        Err(Error::V4l2 { camera, problem: Box::new(Problem::Lost { waited, n_tries, last: Box::new(why) }) })
     }
 
     /// One try to open a lost camera again, not before the pause since the last one is over.
     fn reconnect(&mut self, deadline: Instant) -> Result<(), Error> {
-        let Link::Down { since, last_try, n_tries, why } = &mut self.link else { return Ok(()) };
-        let pause = if *n_tries == 0 { Duration::ZERO } else { RETRY_PAUSE };
+        let (Link::Down { last_try }, Some(outage)) = (&mut self.link, &mut self.outage) else { return Ok(()) };
+        let pause = if outage.n_tries == 0 { Duration::ZERO } else { RETRY_PAUSE };
         let next_try = *last_try + pause;
         if next_try > deadline {
             std::thread::sleep(deadline.saturating_duration_since(Instant::now()));
-            return Err(Error::Reconnecting { camera: self.config.name.clone(), waited: since.elapsed() });
+            return Err(Error::Reconnecting { camera: self.config.name.clone(), waited: outage.since.elapsed() });
         }
         std::thread::sleep(next_try.saturating_duration_since(Instant::now()));
-        *n_tries += 1;
+        outage.n_tries += 1;
         *last_try = Instant::now();
+        let outage = *outage;
         match Running::start(&self.config) {
             Ok(running) => {
+                let Outage { since, n_tries } = outage;
+                let (camera, waited) = (&self.config.name, since.elapsed());
                 log::info!(
-                    "camera {:?}: there again after {:?} and {n_tries} tries: {}",
-                    self.config.name,
-                    since.elapsed(),
+                    "camera {camera:?}: there again after {waited:?} and {n_tries} tries: {}",
                     running.describe()
                 );
                 self.counts.n_reconnections += 1;
                 self.link = Link::Up(Box::new(running));
                 Ok(())
             }
-            Err(Error::V4l2 { camera, problem }) if since.elapsed() < self.config.reconnect_for => {
-                log::debug!("camera {camera:?}: {problem}");
-                *why = *problem;
-                Ok(())
-            }
-            Err(Error::V4l2 { camera, problem }) => {
-                let (waited, n_tries) = (since.elapsed(), *n_tries);
-                Err(Error::V4l2 { camera, problem: Box::new(Problem::Lost { waited, n_tries, last: problem }) })
-            }
+            Err(Error::V4l2 { problem, .. }) => self.give_up_if_late(outage, *problem),
             Err(other) => Err(other),
         }
     }
