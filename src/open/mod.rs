@@ -14,6 +14,9 @@ use kinematics::Chain;
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
+/// What helps where a device is not there.
+const WAY_OUT: &str = "--sim replaces every device by its simulated twin";
+
 /// Which devices a rig file stands for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Devices {
@@ -45,10 +48,10 @@ pub(crate) fn rig(mut rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
         }
     }
     if let Some(device) = absent_device(&rig) {
-        bail!("{device} cannot be opened by this version; --sim replaces every device by its simulated twin");
+        bail!("{device} cannot be opened by this version; {WAY_OUT}");
     }
     check_arm(&rig)?;
-    let real = real::open(&rig)?;
+    let real = real::open(&rig).context(WAY_OUT)?;
     let source = if is_any_simulated(&rig) { simulate(&rig, real)? } else { Box::new(Live::new(real)?) };
     Ok(Opened { rig, source, damage: Arc::default() })
 }
@@ -211,7 +214,10 @@ mod tests {
         assert!(message.contains("\"wrist\" has the parent flange"), "{message}");
         let standing = [&absent[..], &[Override::new("camera.wrist.parent", "base")]].concat();
         let message = refused(&standing);
-        assert!(message.contains("no V4L2 camera goes by \"no such serial\""), "{message}");
+        assert!(
+            message.contains("no V4L2 camera goes by \"no such serial\"") && message.contains("--sim"),
+            "{message}"
+        );
         let without_scale = [&standing[..3], &standing[5..]].concat();
         let message = refused(&without_scale);
         assert!(message.contains("camera.wrist.depth.device"), "{message}");

@@ -28,8 +28,9 @@ pub(super) const BUFFER_CLOCK_MONOTONIC: u32 = 0x2000;
 /// `V4L2_FRMSIZE_TYPE_DISCRETE` and `V4L2_FRMIVAL_TYPE_DISCRETE`.
 pub(super) const DISCRETE: u32 = 1;
 
-/// `V4L2_CTRL_FLAG_DISABLED`.
+/// `V4L2_CTRL_FLAG_DISABLED` and `V4L2_CTRL_FLAG_READ_ONLY`.
 pub(super) const CONTROL_DISABLED: u32 = 0x1;
+pub(super) const CONTROL_READ_ONLY: u32 = 0x4;
 /// `V4L2_CTRL_TYPE_MENU`.
 pub(super) const CONTROL_MENU: u32 = 3;
 

@@ -5,6 +5,7 @@
 use super::Problem;
 use super::abi::{self, QueryControl};
 use super::device::Device;
+use rustix::io::Errno;
 use std::io;
 
 /// Exposure counts of 100 us.
@@ -15,7 +16,7 @@ const EXPOSURE_OFF_FRAC: f64 = 0.1;
 /// A control by the kernel's number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
-enum Id {
+pub(super) enum Id {
     Brightness = 0x0098_0900,
     AutoWhiteBalance = 0x0098_090c,
     AutoGain = 0x0098_0912,
@@ -55,6 +56,8 @@ struct Step {
     value: i32,
     /// How far off it may read back.
     slack: i32,
+    /// Asked for by the rig file; else a camera that refuses is told of and left as it is.
+    is_asked_for: bool,
 }
 
 /// What the camera is set to, as it told itself.
@@ -68,10 +71,12 @@ pub(super) struct Applied {
     pub(super) read_back: Vec<(&'static str, i32)>,
 }
 
-/// What a camera has, as the plan needs it.
-trait Controls {
+/// The controls of a camera: those of a [`Device`], and of tables in tests.
+pub(super) trait Controls {
     fn find(&self, id: Id) -> Option<QueryControl>;
     fn menu(&self, id: Id) -> Vec<i32>;
+    fn set(&self, id: Id, value: i32) -> Result<(), Errno>;
+    fn get(&self, id: Id) -> Result<i32, Errno>;
 }
 
 impl Controls for Device {
@@ -86,40 +91,57 @@ impl Controls for Device {
             _ => (control.minimum..=control.maximum.min(64)).collect(),
         }
     }
+
+    fn set(&self, id: Id, value: i32) -> Result<(), Errno> {
+        self.set_control(id as u32, value)
+    }
+
+    fn get(&self, id: Id) -> Result<i32, Errno> {
+        self.control_value(id as u32)
+    }
 }
 
-/// Sets a device, reads everything back, and compares.
-pub(super) fn apply(settings: &Settings, device: &Device) -> Result<Applied, Problem> {
-    let steps = plan(settings, device)?;
+/// Sets a camera, reads everything back, and compares.
+pub(super) fn apply(settings: &Settings, camera: &impl Controls) -> Result<Applied, Problem> {
+    let steps = plan(settings, camera)?;
     for step in &steps {
-        device.set_control(step.id as u32, step.value).map_err(|error| refused(step.control, error))?;
+        match camera.set(step.id, step.value) {
+            Err(error) if step.is_asked_for || error == Errno::NODEV => return Err(refused(step.control, error)),
+            Err(error) => log::debug!("{}: {error}", step.control),
+            Ok(()) => {}
+        }
     }
-    check(settings, device, &steps)
+    check(settings, camera, &steps)
 }
 
 /// Compares again once images come, for some cameras forget their settings when a stream begins; sets them once more if so.
-pub(super) fn confirm(settings: &Settings, device: &Device) -> Result<Applied, Problem> {
-    match check(settings, device, &plan(settings, device)?) {
-        Err(Problem::ReadBack { .. }) => apply(settings, device),
+pub(super) fn confirm(settings: &Settings, camera: &impl Controls) -> Result<Applied, Problem> {
+    match check(settings, camera, &plan(settings, camera)?) {
+        Err(Problem::ReadBack { .. }) => apply(settings, camera),
         other => other,
     }
 }
 
 /// Reads back what was set, and compares.
-fn check(settings: &Settings, device: &Device, steps: &[Step]) -> Result<Applied, Problem> {
+fn check(settings: &Settings, camera: &impl Controls, steps: &[Step]) -> Result<Applied, Problem> {
     let mut applied = Applied::default();
     for step in steps {
-        let got = device.control_value(step.id as u32).map_err(|error| refused(step.control, error))?;
-        if got.abs_diff(step.value) > step.slack.unsigned_abs() {
+        let got = match camera.get(step.id) {
+            Ok(got) => got,
+            Err(error) if step.is_asked_for || error == Errno::NODEV => return Err(refused(step.control, error)),
+            Err(_) => continue,
+        };
+        if step.is_asked_for && got.abs_diff(step.value) > step.slack.unsigned_abs() {
             return Err(Problem::ReadBack { control: step.control, wanted: step.value, got });
         }
         if step.id == Id::ExposureAbsolute {
             applied.exposure_secs = Some(secs_of_counts(got));
         }
+        // What was not asked for and came out otherwise is to be seen there.
         applied.read_back.push((step.control, got));
     }
     if settings.exposure_micros.is_none() {
-        applied.tells_exposure = exposure_secs(device).is_some();
+        applied.tells_exposure = exposure_secs(camera).is_some();
     } else if applied.exposure_secs.is_none() {
         // It cannot be set: then the rig file knows it.
         applied.exposure_secs = settings.exposure_micros.map(|micros| micros * 1e-6);
@@ -128,8 +150,8 @@ fn check(settings: &Settings, device: &Device, steps: &[Step]) -> Result<Applied
 }
 
 /// The exposure time that a camera tells, seconds.
-pub(super) fn exposure_secs(device: &Device) -> Option<f64> {
-    let counts = device.control_value(Id::ExposureAbsolute as u32).ok()?;
+pub(super) fn exposure_secs(camera: &impl Controls) -> Option<f64> {
+    let counts = camera.get(Id::ExposureAbsolute).ok()?;
     (counts > 0).then(|| secs_of_counts(counts))
 }
 
@@ -137,9 +159,9 @@ fn secs_of_counts(counts: i32) -> f64 {
     f64::from(counts) * MICROS_PER_COUNT * 1e-6
 }
 
-fn refused(control: &'static str, error: rustix::io::Errno) -> Problem {
+fn refused(control: &'static str, error: Errno) -> Problem {
     match error {
-        rustix::io::Errno::NODEV => Problem::Unplugged { source: error.into() },
+        Errno::NODEV => Problem::Unplugged { source: error.into() },
         _ => Problem::Refused { what: control, source: io::Error::from(error) },
     }
 }
@@ -172,7 +194,8 @@ impl Lock {
     fn plan(&self, value: Option<i32>, camera: &impl Controls, steps: &mut Vec<Step>) -> Result<(), Problem> {
         let (control, id) = self.auto;
         if camera.find(id).is_some() {
-            steps.push(Step { control, id, value: i32::from(value.is_none()), slack: 0 });
+            let is_asked_for = value.is_some();
+            steps.push(Step { control, id, value: i32::from(!is_asked_for), slack: 0, is_asked_for });
         }
         if let Some(value) = value {
             steps.push(fixed(self.fixed.0, self.fixed.1, value, camera)?);
@@ -196,7 +219,7 @@ fn fixed(control: &'static str, id: Id, value: i32, camera: &impl Controls) -> R
             step: step.into(),
         });
     }
-    Ok(Step { control, id, value, slack: 0 })
+    Ok(Step { control, id, value, slack: 0, is_asked_for: true })
 }
 
 /// Exposure: the mode, that automation keeps the rate, and the time where it is fixed.
@@ -208,11 +231,12 @@ fn exposure(micros: Option<f64>, camera: &impl Controls, steps: &mut Vec<Step>) 
         Some(_) => [EXPOSURE_MANUAL, EXPOSURE_SHUTTER_PRIORITY],
     };
     if let Some(value) = candidates.into_iter().find(|entry| entries.contains(entry)) {
-        steps.push(Step { control: "exposure mode", id: Id::ExposureAuto, value, slack: 0 });
+        let is_asked_for = micros.is_some();
+        steps.push(Step { control: "exposure mode", id: Id::ExposureAuto, value, slack: 0, is_asked_for });
     }
     if camera.find(Id::ExposureAutoPriority).is_some() {
         let control = "exposure_dynamic_framerate";
-        steps.push(Step { control, id: Id::ExposureAutoPriority, value: 0, slack: 0 });
+        steps.push(Step { control, id: Id::ExposureAutoPriority, value: 0, slack: 0, is_asked_for: false });
     }
     let Some(micros) = micros else { return Ok(()) };
     let Some(known) = camera.find(Id::ExposureAbsolute) else { return Ok(()) };
@@ -231,18 +255,57 @@ fn exposure(micros: Option<f64>, camera: &impl Controls, steps: &mut Vec<Step>) 
     })?;
     #[expect(clippy::cast_possible_truncation, reason = "a tenth of 32 bits")]
     let slack = (f64::from(value) * EXPOSURE_OFF_FRAC) as i32;
-    steps.push(Step { control: "exposure_micros", id: Id::ExposureAbsolute, value, slack: slack.max(known.step) });
+    let slack = slack.max(known.step);
+    steps.push(Step { control: "exposure_micros", id: Id::ExposureAbsolute, value, slack, is_asked_for: true });
     Ok(())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::cell::RefCell;
+    use std::collections::BTreeMap;
 
     /// A camera by a table of its controls: number, least, most, step.
     struct Table {
         controls: &'static [(Id, i32, i32, i32)],
         exposure_modes: &'static [i32],
+    }
+
+    /// Such a camera with the values it has now, by the kernel's numbers; it refuses to be set where it says so.
+    struct Switched {
+        table: Table,
+        values: RefCell<BTreeMap<u32, i32>>,
+        refuses: &'static [Id],
+    }
+
+    impl Controls for Switched {
+        fn find(&self, id: Id) -> Option<QueryControl> {
+            self.table.find(id)
+        }
+
+        fn menu(&self, id: Id) -> Vec<i32> {
+            self.table.menu(id)
+        }
+
+        fn set(&self, id: Id, value: i32) -> Result<(), Errno> {
+            if self.refuses.contains(&id) {
+                return Err(Errno::IO);
+            }
+            // Sensors expose whole rows: what is near is what they take.
+            let taken = if id == Id::ExposureAbsolute { value - 1 } else { value };
+            self.values.borrow_mut().insert(id as u32, taken);
+            Ok(())
+        }
+
+        fn get(&self, id: Id) -> Result<i32, Errno> {
+            self.find(id).ok_or(Errno::INVAL)?;
+            Ok(self.values.borrow().get(&(id as u32)).copied().unwrap_or(0))
+        }
+    }
+
+    fn switched(table: Table, refuses: &'static [Id]) -> Switched {
+        Switched { table, values: RefCell::default(), refuses }
     }
 
     impl Controls for Table {
@@ -253,6 +316,14 @@ mod tests {
 
         fn menu(&self, _: Id) -> Vec<i32> {
             self.exposure_modes.to_vec()
+        }
+
+        fn set(&self, _: Id, _: i32) -> Result<(), Errno> {
+            Err(Errno::ACCESS)
+        }
+
+        fn get(&self, _: Id) -> Result<i32, Errno> {
+            Err(Errno::ACCESS)
         }
     }
 
@@ -329,5 +400,36 @@ mod tests {
         // The key then says what is known of it, as docs/rig.md tells.
         let known = Settings { exposure_micros: Some(4000.0), ..Settings::default() };
         assert_eq!(planned(&known, &VIVID), [(Id::AutoGain, 1)]);
+    }
+
+    #[test]
+    fn what_was_set_is_read_back_and_set_again_where_a_stream_changed_it() {
+        let settings = Settings { exposure_micros: Some(4000.0), gain: Some(12), ..Settings::default() };
+        let camera = switched(C920, &[]);
+        let applied = apply(&settings, &camera).expect("it takes all");
+        assert_eq!(applied.exposure_secs, Some(secs_of_counts(39)), "what the camera made of it");
+        assert!(applied.read_back.contains(&("v4l2.gain", 12)) && !applied.tells_exposure);
+        camera.values.borrow_mut().insert(Id::Gain as u32, 64);
+        assert!(confirm(&settings, &camera).expect("set again").read_back.contains(&("v4l2.gain", 12)));
+        assert_eq!(camera.get(Id::Gain), Ok(12));
+        assert!((secs_of_counts(39) - 0.0039).abs() < 1e-12, "counts of 100 us");
+        // With automatic exposure it is asked for with each image.
+        camera.values.borrow_mut().insert(Id::ExposureAbsolute as u32, 156);
+        let automatic = apply(&Settings::default(), &camera).expect("it takes all");
+        assert!(automatic.tells_exposure && automatic.exposure_secs.is_none());
+        assert_eq!(exposure_secs(&camera), Some(secs_of_counts(156)));
+    }
+
+    #[test]
+    fn only_what_the_rig_file_asks_for_has_to_be_taken() {
+        let camera = switched(C920, &[Id::ExposureAuto, Id::ExposureAutoPriority, Id::AutoWhiteBalance, Id::Gain]);
+        assert!(apply(&Settings::default(), &camera).is_ok(), "nothing was asked for");
+        let gain = Settings { gain: Some(12), ..Settings::default() };
+        let message = apply(&gain, &camera).expect_err("it refuses").to_string();
+        assert!(message.contains("v4l2.gain"), "{message}");
+        // A camera that takes it and does otherwise.
+        let steps = plan(&gain, &C920).expect("it can");
+        let message = check(&gain, &camera, &steps).expect_err("it reads 0").to_string();
+        assert_eq!(message, "v4l2.gain was set to 12 and reads 0");
     }
 }

@@ -156,11 +156,11 @@ impl Device {
         self.ask(&abi::ENUMINPUT, &mut input).is_ok() && input.capabilities & abi::INPUT_DV_TIMINGS != 0
     }
 
-    /// What a control is; `None` where the device has none of this number or has switched it off.
+    /// What a control is; `None` where the device has none of this number that can be set.
     pub(super) fn control(&self, id: u32) -> Option<abi::QueryControl> {
         let mut control = abi::QueryControl { id, ..Default::default() };
         self.ask(&abi::QUERYCTRL, &mut control).ok()?;
-        (control.flags & abi::CONTROL_DISABLED == 0).then_some(control)
+        (control.flags & (abi::CONTROL_DISABLED | abi::CONTROL_READ_ONLY) == 0).then_some(control)
     }
 
     /// The entries of a menu control that this device has.
