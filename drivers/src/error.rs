@@ -71,6 +71,34 @@ pub enum Error {
         /// How long the call waited.
         waited: Duration,
     },
+    /// A CAN interface is not set up as it must be.
+    #[error("CAN interface {interface:?}: {what}; mend it with: {command}")]
+    CanLink {
+        /// Name of the interface.
+        interface: String,
+        /// What is wrong.
+        what: String,
+        /// What a person types to mend it.
+        command: String,
+    },
+    /// A CAN interface could not be read or written, or does not exist.
+    #[error("CAN interface {interface:?}: {source}")]
+    CanBus {
+        /// Name of the interface.
+        interface: String,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// A motor does not answer, or not as it should.
+    #[error("joint {joint:?} on {interface:?}: {reason}")]
+    Motor {
+        /// The joint that it moves.
+        joint: String,
+        /// The bus that it is on.
+        interface: String,
+        /// What is wrong, and what mends it.
+        reason: String,
+    },
     /// A simulated device failed.
     #[error("simulated rig: {reason}")]
     Simulation {

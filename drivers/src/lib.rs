@@ -1,6 +1,7 @@
 //! Devices, recordings and datasets behind a few traits; what comes out is stamped samples.
 
 pub mod align;
+pub mod can;
 pub mod clock;
 pub mod dataset;
 mod decode;

@@ -121,8 +121,9 @@ fn can_interfaces(sys: &Path) -> Vec<Found> {
         .filter(|interface| attribute(&net.join(interface).join("type")).as_deref() == Some(CAN_INTERFACE_KIND))
         .map(|interface| {
             let state = attribute(&net.join(&interface).join("operstate")).unwrap_or_else(|| "unknown".into());
-            let note = "motor arms on CAN have no driver in this version".into();
-            Found { kind: "can", address: interface, name: format!("CAN interface, {state}"), usable: false, note }
+            let note = format!("driver can, [arm.bus.{interface}]; `fieldrig doctor` tells how it is set up");
+            let usable = cfg!(target_os = "linux");
+            Found { kind: "can", address: interface, name: format!("CAN interface, {state}"), usable, note }
         })
         .collect()
 }

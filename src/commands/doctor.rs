@@ -1,5 +1,6 @@
 //! `fieldrig doctor`: what this machine lacks for a rig, each with the line that mends it.
 
+use crate::config::Rig;
 use crate::exit::Exit;
 use crate::print;
 use drivers::v4l2;
@@ -19,6 +20,8 @@ const FINE_CLOCK: Duration = Duration::from_micros(1);
 /// Flags of `doctor`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
+    /// Rig file: what it names is checked against what it wants
+    rig: Option<PathBuf>,
     /// Print one JSON object a line
     #[arg(long)]
     json: bool,
@@ -58,6 +61,7 @@ impl Finding {
 
 /// Checks everything; fails when a finding does.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let rig = args.rig.as_ref().map(|path| Rig::load(path, &[])).transpose()?;
     let mut findings = gpu();
     findings.push(simulation());
     findings.push(clock());
@@ -67,6 +71,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     findings.push(realtime(Path::new("/proc")));
     findings.push(cameras(Path::new("/dev")));
     findings.extend(v4l2::cameras().into_iter().flatten().filter_map(|camera| usb(&camera)));
+    findings.extend(can(rig.as_ref()));
     findings.push(port(USUAL_ADDRESS));
     for finding in &findings {
         if args.json {
@@ -249,6 +254,48 @@ fn usb(camera: &v4l2::Found) -> Option<Finding> {
     let says = format!("{name}: its port carries {carries} at most, too little for {}", beyond.join(", "));
     let mend = "choose v4l2.format = \"mjpeg\", a smaller size or a lower rate, or a USB 3 port; `lsusb -t` shows who shares one";
     Some(Finding::warn("usb", says, mend))
+}
+
+/// How CAN interfaces are set up: those that the rig names as it wants them, the others in themselves.
+#[cfg(target_os = "linux")]
+fn can(rig: Option<&Rig>) -> Vec<Finding> {
+    use drivers::can::{BusConfig, Link, interfaces};
+    let named = rig.map_or(&[][..], |rig| &rig.arm.buses);
+    let others = interfaces().into_iter().filter(|name| !named.iter().any(|bus| bus.interface == *name));
+    let mut findings = Vec::new();
+    for (interface, bus) in
+        named.iter().map(|bus| (bus.interface.clone(), Some(bus))).chain(others.map(|name| (name, None)))
+    {
+        let link = match Link::read(&interface) {
+            Ok(link) => link,
+            Err(error) => {
+                findings.push(Finding::fail("can", error.to_string(), "fieldrig devices lists those that there are"));
+                continue;
+            }
+        };
+        let own = BusConfig {
+            interface,
+            bitrate_hz: link.bitrate_hz.unwrap_or(1_000_000),
+            data_bitrate_hz: link.data_bitrate_hz,
+        };
+        let complaints = link.complaints(bus.unwrap_or(&own));
+        if complaints.is_empty() {
+            findings.push(Finding::ok("can", link.to_string()));
+        }
+        findings.extend(complaints.into_iter().map(|complaint| {
+            let says = format!("{}: {}", link.interface, complaint.what);
+            match bus {
+                Some(_) => Finding::fail("can", says, complaint.command),
+                None => Finding::warn("can", says, complaint.command),
+            }
+        }));
+    }
+    findings
+}
+
+#[cfg(not(target_os = "linux"))]
+fn can(_rig: Option<&Rig>) -> Vec<Finding> {
+    Vec::new()
 }
 
 fn port(address: &str) -> Finding {

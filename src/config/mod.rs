@@ -2,6 +2,7 @@
 //!
 //! Every key is in `docs/rig.md`. Unknown keys are refused, flags override keys of the same name.
 
+mod can;
 mod error;
 mod read;
 mod section;
@@ -13,6 +14,7 @@ pub(crate) use error::ConfigError;
 pub(crate) use write::methods;
 
 use crate::method::Kind;
+use drivers::can::{BusConfig, MotorConfig};
 use drivers::v4l2::{Delivery, V4l2Format};
 use kinematics::{Intrinsics, Transform};
 use std::net::SocketAddr;
@@ -58,6 +60,12 @@ pub(crate) struct Arm {
     pub(crate) base_link: String,
     pub(crate) flange_link: String,
     pub(crate) max_speed_rad_s: f64,
+    /// How often motors on CAN buses are asked.
+    pub(crate) rate_hz: f64,
+    /// CAN buses.
+    pub(crate) buses: Vec<BusConfig>,
+    /// Motors on them, in the order of `joints`.
+    pub(crate) motors: Vec<MotorConfig>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

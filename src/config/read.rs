@@ -115,12 +115,32 @@ fn settle_joints(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
         arm.joints = chain.joint_names().to_vec();
     }
     chain.order_in(&arm.joints).map_err(|e| robot("arm.joints", e))?;
+    settle_motors(file, arm)?;
     let (n, n_joints) = (arm.joint_offsets.len(), arm.joints.len());
     if n == 0 || (n == n_joints && arm.joint_offsets.iter().all(|offset| offset.abs() <= MOST_OFFSET)) {
         return Ok(());
     }
     let reason = format!("{n} numbers; must be {n_joints} from -{MOST_OFFSET} to {MOST_OFFSET}, or none");
     Err(ConfigError::Robot { file: file.to_owned(), key: "arm.joint_offsets", reason })
+}
+
+/// Brings the motors into the order of the joints; an arm on CAN buses has one for each, and none besides.
+fn settle_motors(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
+    if arm.driver != ArmDriver::Can {
+        return Ok(());
+    }
+    let problem = |reason| ConfigError::Robot { file: file.to_owned(), key: "arm.motor", reason };
+    let place = |name: &String| arm.joints.iter().position(|joint| joint == name);
+    if let Some(lost) = arm.motors.iter().find(|motor| place(&motor.joint).is_none()) {
+        return Err(problem(format!("{:?} is none of the joints {}", lost.joint, arm.joints.join(", "))));
+    }
+    if let Some(joint) = arm.joints.iter().find(|joint| !arm.motors.iter().any(|motor| motor.joint == **joint)) {
+        return Err(problem(format!("the joint {joint:?} has no table [arm.motor.{joint}]")));
+    }
+    let mut motors = std::mem::take(&mut arm.motors);
+    motors.sort_by_key(|motor| place(&motor.joint));
+    arm.motors = motors;
+    Ok(())
 }
 
 fn arm(mut keys: Section<'_>) -> (Arm, String) {
@@ -138,6 +158,7 @@ fn arm(mut keys: Section<'_>) -> (Arm, String) {
     if flange_link.is_none() {
         keys.missing("flange_link", "the link that cameras with the parent flange are fixed to");
     }
+    let (buses, motors) = super::can::read(&mut keys);
     let arm = Arm {
         driver: driver.unwrap_or(ArmDriver::Sim),
         address: keys.text("address").unwrap_or_default(),
@@ -147,6 +168,9 @@ fn arm(mut keys: Section<'_>) -> (Arm, String) {
         base_link: keys.text("base_link").unwrap_or_default(),
         flange_link: flange_link.unwrap_or_default(),
         max_speed_rad_s: keys.number("max_speed_rad_s", 0.0..=10.0).unwrap_or(0.5),
+        rate_hz: keys.number("rate_hz", 1.0..=2000.0).unwrap_or(200.0),
+        buses,
+        motors,
     };
     keys.end();
     (arm, urdf.unwrap_or_default())

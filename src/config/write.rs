@@ -24,24 +24,25 @@ pub(super) fn rig(rig: &Rig) -> String {
 }
 
 /// A table of the keys that have a value.
-fn table<const N: usize>(entries: [(&str, Option<Value>); N]) -> Table {
+pub(super) fn table<const N: usize>(entries: [(&str, Option<Value>); N]) -> Table {
     entries.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))).collect()
 }
 
-fn is(value: impl Into<Value>) -> Option<Value> {
+pub(super) fn is(value: impl Into<Value>) -> Option<Value> {
     Some(value.into())
 }
 
-fn whole(number: u64) -> Option<Value> {
+pub(super) fn whole(number: u64) -> Option<Value> {
     // Larger numbers cannot come from a rig file.
     is(i64::try_from(number).unwrap_or(i64::MAX))
 }
 
-fn name_of<T: PartialEq>(choices: &[(&'static str, T)], choice: &T) -> Option<Value> {
+pub(super) fn name_of<T: PartialEq>(choices: &[(&'static str, T)], choice: &T) -> Option<Value> {
     choices.iter().find(|(_, candidate)| candidate == choice).map(|(name, _)| Value::from(*name))
 }
 
 fn arm(arm: &Arm) -> Table {
+    let [buses, motors] = super::can::write(&arm.buses, &arm.motors);
     table([
         ("driver", name_of(&ARM_DRIVERS, &arm.driver)),
         ("address", is(arm.address.as_str())),
@@ -51,6 +52,9 @@ fn arm(arm: &Arm) -> Table {
         ("base_link", is(arm.base_link.as_str())),
         ("flange_link", is(arm.flange_link.as_str())),
         ("max_speed_rad_s", is(arm.max_speed_rad_s)),
+        ("rate_hz", is(arm.rate_hz)),
+        ("bus", buses),
+        ("motor", motors),
     ])
 }
 

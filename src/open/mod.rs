@@ -125,7 +125,7 @@ fn is_any_simulated(rig: &Rig) -> bool {
 
 /// The first device of a rig that has no driver yet.
 fn absent_device(rig: &Rig) -> Option<String> {
-    if !matches!(rig.arm.driver, ArmDriver::Sim | ArmDriver::None) {
+    if !matches!(rig.arm.driver, ArmDriver::Sim | ArmDriver::Can | ArmDriver::None) {
         return Some(format!("arm driver {:?}", format!("{:?}", rig.arm.driver).to_lowercase()));
     }
     if matches!(rig.base.driver, BaseDriver::Tags | BaseDriver::Rgbd) {

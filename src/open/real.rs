@@ -1,10 +1,12 @@
 //! The devices of a rig that are not simulated.
 
-use crate::config::{BaseDriver, Camera, CameraDriver, Depth, Rig, ScannerDriver};
+use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Depth, Rig, ScannerDriver};
 use anyhow::bail;
+#[cfg(target_os = "linux")]
+use drivers::can::{ArmConfig, CanArm};
 use drivers::udp::{UdpBase, UdpScanner};
 use drivers::v4l2::{Config, Settings, V4l2Camera, V4l2Format};
-use drivers::{Base, Devices, RangeScanner};
+use drivers::{Arm, Base, Devices, RangeScanner};
 use std::time::Duration;
 
 /// Opens them; a rig may have none.
@@ -15,6 +17,9 @@ pub(super) fn open(rig: &Rig) -> anyhow::Result<Devices> {
         for config in std::iter::once(v4l2_color(camera)).chain(depth) {
             devices.cameras.push(Box::new(V4l2Camera::open(config)?));
         }
+    }
+    if rig.arm.driver == ArmDriver::Can {
+        devices.arm = Some(can_arm(rig)?);
     }
     if rig.base.driver == BaseDriver::Udp {
         let base = UdpBase::open(rig.base.address)?;
@@ -27,6 +32,19 @@ pub(super) fn open(rig: &Rig) -> anyhow::Result<Devices> {
         devices.scanners.push(Box::new(open) as Box<dyn RangeScanner>);
     }
     Ok(devices)
+}
+
+/// An arm whose joints are motors on CAN buses.
+#[cfg(target_os = "linux")]
+fn can_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
+    let Rig { arm, .. } = rig;
+    let config = ArmConfig { buses: arm.buses.clone(), motors: arm.motors.clone(), rate_hz: arm.rate_hz };
+    Ok(Box::new(CanArm::open(&config)?))
+}
+
+#[cfg(not(target_os = "linux"))]
+fn can_arm(_rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
+    bail!("arms on CAN buses are read on Linux only")
 }
 
 /// The color images of a camera.

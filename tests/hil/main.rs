@@ -1,12 +1,13 @@
-//! Hardware in the loop without hardware: the production drivers against the kernel's own test devices (vivid), in a
+//! Hardware in the loop without hardware: the production drivers against the kernel's own test devices (vivid, vcan), in a
 //! User-Mode Linux kernel that is built once.
 //!
 //! The test below runs on the host: it lays out a root folder with this very program in it, boots the kernel on it and reads its
-//! console. Inside, the same program runs the tests of `cameras.rs`, which are ignored outside.
+//! console. Inside, the same program runs the tests of `cameras.rs` and `can.rs`, which are ignored outside.
 
 #![expect(clippy::print_stdout, reason = "the report of what was seen in the virtual kernel")]
 
 mod cameras;
+mod can;
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -39,7 +40,7 @@ const MAX_RUN: Duration = Duration::from_secs(420);
 const DEMAND: &str = "FIELDRIG_HIL";
 
 #[test]
-fn cameras_in_a_kernel_of_their_own() {
+fn cameras_and_buses_in_a_kernel_of_their_own() {
     let is_demanded = std::env::var(DEMAND).is_ok_and(|value| value == "demand");
     if let Some(why) = missing() {
         assert!(!is_demanded, "{DEMAND}=demand, but {why}");
@@ -112,8 +113,10 @@ fn lay_out(root: &Path) {
             fs::copy(&library, place).expect("ldd found it");
         }
     }
-    let rig = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/hil/vivid.toml");
-    fs::copy(rig, root.join("rigs/vivid.toml")).expect("room on the disk");
+    for file in ["vivid.toml", "vivid-can.toml", "two.urdf"] {
+        let from = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/hil").join(file);
+        fs::copy(from, root.join("rigs").join(file)).expect("room on the disk");
+    }
     let init = root.join("init");
     fs::write(&init, INIT).expect("room on the disk");
     fs::set_permissions(&init, fs::Permissions::from_mode(0o755)).expect("our own file");
