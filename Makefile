@@ -4,7 +4,7 @@
 # the page's npm packages) and says so; without root it prints the one line to run.
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check deps web cargo packages mujoco open-ends
+.PHONY: help demo test check deps web cargo packages hil-packages mujoco open-ends
 
 # One feature set everywhere, so that dependencies compile once.
 FEATURES := --features sim
@@ -19,7 +19,7 @@ demo: deps web ## Simulate a rig (RIG=static-arm, mobile-arm, mobile-base-small,
 	cargo build --release $(FEATURES)
 	target/release/fieldrig run rigs/$(RIG).toml --sim
 
-test: check web ## Lints, documentation and every test that needs no device
+test: check web hil-packages ## Lints, documentation and every test that needs no device
 	cargo test --workspace $(FEATURES) --no-fail-fast
 
 check: deps open-ends ## Format, clippy, documentation, kernels, licences, open ends
@@ -45,6 +45,10 @@ cargo:
 
 packages:
 	@scripts/install-packages.sh build gpu sim web
+
+# Where these cannot be installed the tests in the virtual kernel are skipped with a line, unless FIELDRIG_HIL=demand.
+hil-packages: packages
+	@scripts/install-packages.sh hil || [ "$$FIELDRIG_HIL" != demand ]
 
 mujoco: packages
 	@scripts/fetch-mujoco.sh

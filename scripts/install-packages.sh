@@ -2,7 +2,7 @@
 # Installs the system packages that are missing, and only those, with apt; says which and why.
 # Without root it prints the one line to run and stops; where a package is there already it does nothing.
 #
-# usage: install-packages.sh GROUP...      groups: build gpu sim web
+# usage: install-packages.sh GROUP...      groups: build gpu sim web hil
 set -eu
 
 missing=""
@@ -54,8 +54,23 @@ for group in "$@"; do
         need_command node nodejs "bundles the web page"
         need_command npm npm "fetches what the web page is made of"
         ;;
+    hil)
+        # The virtual kernel of tests/hil is built of Debian 12's source; elsewhere its tests are skipped, with a line.
+        if ! grep -q '^VERSION_CODENAME=bookworm$' /etc/os-release 2>/dev/null || [ "$(uname -m)" != x86_64 ]; then
+            continue
+        fi
+        need linux-source-6.1 "the kernel that plays cameras and CAN buses for the tests"
+        need_command make make "builds it"
+        need_command flex flex "builds it"
+        need_command bison bison "builds it"
+        need_command bc bc "builds it"
+        need_command xz xz-utils "unpacks it"
+        need libelf-dev "builds it"
+        need libssl-dev "builds it"
+        need busybox-static "starts the tests in it"
+        ;;
     *)
-        echo "install-packages: unknown group $group (build, gpu, sim, web)" >&2
+        echo "install-packages: unknown group $group (build, gpu, sim, web, hil)" >&2
         exit 2
         ;;
     esac

@@ -217,12 +217,18 @@ impl Pump {
         let image = &seen.image;
         let pixels = match image.format {
             PixelFormat::Rgb8 => LivePixels::Rgb(image.data.clone()),
-            PixelFormat::Jpeg => LivePixels::Jpeg(image.data.clone()),
-            PixelFormat::Gray8 | PixelFormat::Png => match image.decode_rgb() {
-                Ok(rgb) => LivePixels::Rgb(rgb.into()),
-                // The join counts images that do not decode.
+            // Browsers show no JPEG that a camera sent without its tables.
+            PixelFormat::Jpeg => match drivers::jpeg::first_image(&image.data) {
+                Ok(jpeg) => LivePixels::Jpeg(jpeg.as_ref().into()),
                 Err(_) => return,
             },
+            PixelFormat::Bgr8 | PixelFormat::Gray8 | PixelFormat::Yuv { .. } | PixelFormat::Png => {
+                match image.decode_rgb() {
+                    Ok(rgb) => LivePixels::Rgb(rgb.into()),
+                    // The join counts images that do not decode.
+                    Err(_) => return,
+                }
+            }
             PixelFormat::DepthU16 { .. } => return,
         };
         let Some(&(focal_px, principal_px)) = self.input.lenses.get(&image.camera) else { return };

@@ -88,11 +88,14 @@ fn an_unknown_key_of_a_rig_file_is_named_with_the_nearest_known_one() {
 }
 
 #[test]
-fn a_device_without_driver_names_the_simulation() {
+fn a_device_that_is_not_there_or_has_no_driver_names_the_simulation() {
     let folder = tempfile::tempdir().expect("a folder");
     let from = "[camera.wrist]\ndriver = \"sim\"";
-    let rig = changed_rig(folder.path(), from, "[camera.wrist]\ndriver = \"v4l2\"\ndevice = \"/dev/video9\"");
-    assert_refused(&["run", &rig, "--listen", "127.0.0.1:0"], 1, &["wrist", "--sim"]);
+    for driver in ["v4l2", "realsense"] {
+        let to = format!("[camera.wrist]\ndriver = {driver:?}\ndevice = \"/dev/video99\"");
+        let rig = changed_rig(folder.path(), from, &to);
+        assert_refused(&["run", &rig, "--listen", "127.0.0.1:0"], 1, &["wrist", "--sim"]);
+    }
 }
 
 #[test]

@@ -35,6 +35,22 @@ pub enum Error {
         /// How long the call waited.
         waited: Duration,
     },
+    /// A V4L2 camera cannot be opened, or was lost for good.
+    #[error("camera {camera:?}: {problem}")]
+    V4l2 {
+        /// Name in the rig file.
+        camera: String,
+        /// What is wrong.
+        problem: Box<crate::v4l2::Problem>,
+    },
+    /// A camera was lost and is looked for; asking again may find it.
+    #[error("camera {camera:?}: lost for {waited:?}, looking for it")]
+    Reconnecting {
+        /// Name in the rig file.
+        camera: String,
+        /// Since when.
+        waited: Duration,
+    },
     /// An arm stayed silent.
     #[error("arm: no joint readings within {waited:?}")]
     NoJoints {
@@ -54,6 +70,34 @@ pub enum Error {
         scanner: String,
         /// How long the call waited.
         waited: Duration,
+    },
+    /// A CAN interface is not set up as it must be.
+    #[error("CAN interface {interface:?}: {what}; mend it with: {command}")]
+    CanLink {
+        /// Name of the interface.
+        interface: String,
+        /// What is wrong.
+        what: String,
+        /// What a person types to mend it.
+        command: String,
+    },
+    /// A CAN interface could not be read or written, or does not exist.
+    #[error("CAN interface {interface:?}: {source}")]
+    CanBus {
+        /// Name of the interface.
+        interface: String,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// A motor does not answer, or not as it should.
+    #[error("joint {joint:?} on {interface:?}: {reason}")]
+    Motor {
+        /// The joint that it moves.
+        joint: String,
+        /// The bus that it is on.
+        interface: String,
+        /// What is wrong, and what mends it.
+        reason: String,
     },
     /// A simulated device failed.
     #[error("simulated rig: {reason}")]
@@ -128,6 +172,14 @@ pub enum Error {
         got_bytes: usize,
         /// Bytes needed.
         expected_bytes: usize,
+    },
+    /// A device tells colours that are not decoded.
+    #[error("V4L2 colorspace {colorspace} with Y'CbCr encoding {ycbcr_enc}: only BT.601 and BT.709 are decoded")]
+    YuvColors {
+        /// `enum v4l2_colorspace`.
+        colorspace: u32,
+        /// `enum v4l2_ycbcr_encoding`.
+        ycbcr_enc: u32,
     },
     /// Colour was asked of a depth image or depth of a colour image.
     #[error("camera {camera:?}: the image at {} ns holds no {wanted}", stamp.0)]

@@ -1,18 +1,24 @@
 //! Devices, recordings and datasets behind a few traits; what comes out is stamped samples.
 
+pub mod align;
+pub mod can;
 pub mod clock;
 pub mod dataset;
 mod decode;
 mod error;
+pub mod jpeg;
 mod live;
 pub mod recording;
 mod sample;
 pub mod udp;
+pub mod v4l2;
 pub mod wire;
+mod yuv;
 
 pub use error::{Error, Kept};
 pub use live::{Devices, Live};
 pub use sample::{BasePose, Image, PixelFormat, RangePoint, RangeScan, Sample, TruthImage};
+pub use yuv::{V4l2Colors, YuvColors, YuvLayout, YuvMatrix, YuvRange};
 
 use kinematics::{Intrinsics, JointState};
 use std::time::Duration;
@@ -25,7 +31,8 @@ pub trait Camera: Send {
     fn intrinsics(&self) -> &Intrinsics;
     /// Waits for the next image this call has not returned yet, in stamp order; colour and depth are told apart by format.
     ///
-    /// A slow caller loses the oldest images; the loss is counted in [`Image::n_skipped`].
+    /// A slow caller loses the oldest images; the loss is counted in [`Image::n_skipped`]. A camera that was unplugged and is
+    /// looked for says [`Error::Reconnecting`], for a bounded time.
     fn next_image(&mut self, timeout: Duration) -> Result<Image, Error>;
 }
 

@@ -80,23 +80,24 @@ impl Live {
             let silent = move |waited| Error::NoImage { camera: name.clone(), waited };
             live.read(format!("camera {:?}", camera.name()), MAX_IMAGES, silent, move || {
                 match camera.next_image(POLL) {
-                    Err(Error::NoImage { .. }) => Ok(None),
-                    image => image.map(Sample::Image).map(Some),
+                    Err(Error::NoImage { .. }) => Ok(Heard::Nothing),
+                    Err(Error::Reconnecting { .. }) => Ok(Heard::Mending),
+                    image => image.map(Sample::Image).map(Heard::Sample),
                 }
             })?;
         }
         if let Some(mut arm) = arm {
             let silent = |waited| Error::NoJoints { waited };
             live.read("arm".to_owned(), MAX_JOINTS, silent, move || match arm.read(POLL) {
-                Err(Error::NoJoints { .. }) => Ok(None),
-                state => state.map(Sample::Joints).map(Some),
+                Err(Error::NoJoints { .. }) => Ok(Heard::Nothing),
+                state => state.map(Sample::Joints).map(Heard::Sample),
             })?;
         }
         if let Some(mut base) = base {
             let silent = |waited| Error::NoBasePose { waited };
             live.read("base".to_owned(), MAX_JOINTS, silent, move || match base.next_pose(POLL) {
-                Err(Error::NoBasePose { .. }) => Ok(None),
-                pose => pose.map(Sample::Base).map(Some),
+                Err(Error::NoBasePose { .. }) => Ok(Heard::Nothing),
+                pose => pose.map(Sample::Base).map(Heard::Sample),
             })?;
         }
         for mut scanner in scanners {
@@ -104,8 +105,8 @@ impl Live {
             let silent = move |waited| Error::NoScan { scanner: name.clone(), waited };
             let device = format!("range scanner {:?}", scanner.name());
             live.read(device, MAX_SCANS, silent, move || match scanner.next_scan(POLL) {
-                Err(Error::NoScan { .. }) => Ok(None),
-                scan => scan.map(Sample::Range).map(Some),
+                Err(Error::NoScan { .. }) => Ok(Heard::Nothing),
+                scan => scan.map(Sample::Range).map(Heard::Sample),
             })?;
         }
         Ok(live)
@@ -117,7 +118,7 @@ impl Live {
         device: String,
         max_waiting: usize,
         silent: impl Fn(Duration) -> Error + Send + 'static,
-        read: impl FnMut() -> Result<Option<Sample>, Error> + Send + 'static,
+        read: impl FnMut() -> Result<Heard, Error> + Send + 'static,
     ) -> Result<(), Error> {
         let device_ix = self.threads.len();
         self.spawn(device, move |shared| read_until_stopped(shared, device_ix, max_waiting, read, silent))
@@ -140,12 +141,21 @@ impl Live {
     }
 }
 
-/// The loop of one device's thread: `read` waits [`POLL`] and gives `None` when nothing came.
+/// What one wait on a device led to.
+enum Heard {
+    Sample(Sample),
+    /// It is there and said nothing.
+    Nothing,
+    /// It is lost, and its driver looks for it: how long, the driver bounds.
+    Mending,
+}
+
+/// The loop of one device's thread: `read` waits [`POLL`].
 fn read_until_stopped(
     shared: &Shared,
     device_ix: usize,
     max_waiting: usize,
-    mut read: impl FnMut() -> Result<Option<Sample>, Error>,
+    mut read: impl FnMut() -> Result<Heard, Error>,
     silent: impl Fn(Duration) -> Error,
 ) {
     let mut waited = Duration::ZERO;
@@ -156,17 +166,21 @@ fn read_until_stopped(
             return;
         }
         let error = match sample {
-            Ok(Some(sample)) => {
+            Ok(Heard::Sample(sample)) => {
                 waited = Duration::ZERO;
                 state.put(device_ix, max_waiting, sample);
                 shared.arrived.notify_all();
                 continue;
             }
-            Ok(None) if waited + POLL < MAX_SILENCE => {
+            Ok(Heard::Mending) => {
+                waited = Duration::ZERO;
+                continue;
+            }
+            Ok(Heard::Nothing) if waited + POLL < MAX_SILENCE => {
                 waited += POLL;
                 continue;
             }
-            Ok(None) => silent(waited + POLL),
+            Ok(Heard::Nothing) => silent(waited + POLL),
             Err(error) => error,
         };
         if !state.failed {
@@ -288,15 +302,16 @@ mod tests {
         }
     }
 
+    const LENS: Intrinsics = Intrinsics {
+        size_px: [1, 1],
+        focal_px: [1.0; 2],
+        principal_px: [0.5; 2],
+        lens: Lens::Pinhole,
+        rectified: true,
+    };
+
     fn fast(n_images: i64) -> Box<dyn Camera> {
-        let intrinsics = Intrinsics {
-            size_px: [1, 1],
-            focal_px: [1.0; 2],
-            principal_px: [0.5; 2],
-            lens: Lens::Pinhole,
-            rectified: true,
-        };
-        Box::new(Fast { intrinsics, n_images, next: 0 })
+        Box::new(Fast { intrinsics: LENS, n_images, next: 0 })
     }
 
     struct Still {
@@ -333,6 +348,41 @@ mod tests {
         }
         assert_eq!(stamps, (94..=101).collect::<Vec<_>>());
         assert_eq!(n_skipped, [47, 46], "51 colour images with 4 delivered, 50 depth images with 4 delivered");
+    }
+
+    /// A camera whose cable is out for longer than a silent one is waited for; it waits for nothing itself.
+    struct Unplugged {
+        camera: Fast,
+        n_tries: u32,
+    }
+
+    impl Camera for Unplugged {
+        fn name(&self) -> &str {
+            self.camera.name()
+        }
+        fn intrinsics(&self) -> &Intrinsics {
+            self.camera.intrinsics()
+        }
+        fn next_image(&mut self, timeout: Duration) -> Result<Image, Error> {
+            self.n_tries += 1;
+            if self.n_tries <= 100 {
+                return Err(Error::Reconnecting { camera: "fast".into(), waited: timeout * self.n_tries });
+            }
+            self.camera.next_image(timeout)
+        }
+    }
+
+    #[test]
+    fn a_camera_that_is_looked_for_is_not_silent() {
+        let camera = Unplugged { camera: Fast { intrinsics: LENS, n_images: 1, next: 0 }, n_tries: 0 };
+        let devices = Devices { cameras: vec![Box::new(camera)], ..Devices::default() };
+        let mut live = Live::new(devices).expect("threads start");
+        while live.shared.lock().n_running > 0 {
+            std::thread::yield_now();
+        }
+        // The image came after ten seconds of looking, and the error is the one after it.
+        assert!(live.next_sample().expect_err("the cable").to_string().contains("cable pulled"));
+        assert_eq!(live.next_sample().expect("told once").expect("an image").stamp(), Stamp(1));
     }
 
     #[test]

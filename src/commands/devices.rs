@@ -2,6 +2,7 @@
 
 use crate::exit::Exit;
 use crate::print;
+use drivers::v4l2;
 use serde::Serialize;
 use std::path::Path;
 
@@ -37,7 +38,7 @@ struct Found {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut found = vec![gpu(), simulation()];
     let sys = Path::new("/sys");
-    found.extend(video_devices(sys));
+    found.extend(video_devices(v4l2::cameras()));
     found.extend(realsense_cameras(sys));
     found.extend(can_interfaces(sys));
     for device in &found {
@@ -74,22 +75,28 @@ fn simulation() -> Found {
     Found { kind: "simulation", address: "--sim".into(), name: "MuJoCo".into(), usable, note: note.into() }
 }
 
-/// V4L2 devices: cameras, capture cards and their metadata nodes.
-fn video_devices(sys: &Path) -> Vec<Found> {
-    let describe = |node: String, name: String| Found {
-        kind: "camera",
-        address: format!("/dev/{node}"),
-        name,
-        usable: false,
-        note: "V4L2 cameras have no driver in this version".into(),
+/// V4L2 devices that give images, with all that they offer.
+fn video_devices(cameras: Vec<Result<v4l2::Found, v4l2::Problem>>) -> Vec<Found> {
+    let describe = |camera: v4l2::Found| {
+        let usb = camera.usb_mbits.map_or(String::new(), |mbits| format!(", USB at {mbits} Mbit/s"));
+        let serial = camera.serial.as_ref().map_or(String::new(), |serial| format!(", serial {serial}"));
+        let offers = v4l2::summary(&camera.modes);
+        Found {
+            kind: "camera",
+            address: camera.address(),
+            usable: !camera.modes.is_empty(),
+            note: format!("driver v4l2, {}, at {}{serial}{usb}: {offers}", camera.node.display(), camera.bus),
+            name: camera.name,
+        }
     };
-    children(&sys.join("class/video4linux"))
-        .into_iter()
-        .map(|node| {
-            let name = attribute(&sys.join("class/video4linux").join(&node).join("name")).unwrap_or_default();
-            describe(node, name)
-        })
-        .collect()
+    let refused = |problem: v4l2::Problem| Found {
+        kind: "camera",
+        address: "unknown".into(),
+        name: "V4L2".into(),
+        usable: false,
+        note: problem.to_string(),
+    };
+    cameras.into_iter().map(|camera| camera.map_or_else(refused, describe)).collect()
 }
 
 /// RealSense cameras on USB.
@@ -114,8 +121,9 @@ fn can_interfaces(sys: &Path) -> Vec<Found> {
         .filter(|interface| attribute(&net.join(interface).join("type")).as_deref() == Some(CAN_INTERFACE_KIND))
         .map(|interface| {
             let state = attribute(&net.join(&interface).join("operstate")).unwrap_or_else(|| "unknown".into());
-            let note = "motor arms on CAN have no driver in this version".into();
-            Found { kind: "can", address: interface, name: format!("CAN interface, {state}"), usable: false, note }
+            let note = format!("driver can, [arm.bus.{interface}]; `fieldrig doctor` tells how it is set up");
+            let usable = cfg!(target_os = "linux");
+            Found { kind: "can", address: interface, name: format!("CAN interface, {state}"), usable, note }
         })
         .collect()
 }
@@ -149,7 +157,6 @@ mod tests {
     #[test]
     fn sysfs_is_read_by_kind() {
         let sys = tempfile::tempdir().expect("folder");
-        write(sys.path(), "class/video4linux/video2/name", "Integrated Camera\n");
         write(sys.path(), "class/net/can0/type", "280\n");
         write(sys.path(), "class/net/can0/operstate", "up\n");
         write(sys.path(), "class/net/eth0/type", "1\n");
@@ -157,9 +164,6 @@ mod tests {
         write(sys.path(), "bus/usb/devices/2-1/product", "Intel(R) RealSense(TM) Depth Camera 435i\n");
         write(sys.path(), "bus/usb/devices/2-2/idVendor", "8086\n");
         write(sys.path(), "bus/usb/devices/2-2/product", "Bluetooth\n");
-        let video = video_devices(sys.path());
-        assert_eq!(video.len(), 1);
-        assert_eq!((video[0].address.as_str(), video[0].name.as_str()), ("/dev/video2", "Integrated Camera"));
         let can = can_interfaces(sys.path());
         assert_eq!(can.len(), 1);
         assert_eq!((can[0].address.as_str(), can[0].name.as_str()), ("can0", "CAN interface, up"));
@@ -169,9 +173,28 @@ mod tests {
     }
 
     #[test]
+    fn cameras_are_told_by_the_name_that_stays() {
+        let camera = v4l2::Found {
+            node: "/dev/video2".into(),
+            name: "C920".into(),
+            bus: "usb-0000:00:14.0-2".into(),
+            serial: Some("A1B2".into()),
+            links: vec!["/dev/v4l/by-id/usb-A1B2-index0".into()],
+            usb_mbits: Some(480.0),
+            modes: Vec::new(),
+        };
+        let source = std::io::ErrorKind::PermissionDenied.into();
+        let refused = v4l2::Problem::Open { path: "/dev/video4".into(), source };
+        let found = video_devices(vec![Ok(camera), Err(refused)]);
+        assert_eq!(found[0].address, "/dev/v4l/by-id/usb-A1B2-index0");
+        assert!(found[0].note.contains("/dev/video2, at usb-0000:00:14.0-2, serial A1B2, USB at 480 Mbit/s"));
+        assert!(!found[0].usable && !found[1].usable, "the one offers nothing, the other may not be opened");
+        assert!(found[1].note.contains("usermod -aG video"), "{}", found[1].note);
+    }
+
+    #[test]
     fn an_absent_sysfs_has_no_devices() {
         let sys = tempfile::tempdir().expect("folder");
-        assert_eq!(video_devices(sys.path()), []);
         assert_eq!(realsense_cameras(sys.path()), []);
         assert_eq!(can_interfaces(sys.path()), []);
     }

@@ -1,7 +1,9 @@
 //! `fieldrig doctor`: what this machine lacks for a rig, each with the line that mends it.
 
+use crate::config::Rig;
 use crate::exit::Exit;
 use crate::print;
+use drivers::v4l2;
 use serde::Serialize;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
@@ -18,6 +20,8 @@ const FINE_CLOCK: Duration = Duration::from_micros(1);
 /// Flags of `doctor`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
+    /// Rig file: what it names is checked against what it wants
+    rig: Option<PathBuf>,
     /// Print one JSON object a line
     #[arg(long)]
     json: bool,
@@ -57,6 +61,7 @@ impl Finding {
 
 /// Checks everything; fails when a finding does.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let rig = args.rig.as_ref().map(|path| Rig::load(path, &[])).transpose()?;
     let mut findings = gpu();
     findings.push(simulation());
     findings.push(clock());
@@ -65,6 +70,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     findings.push(memory(Path::new("/proc")));
     findings.push(realtime(Path::new("/proc")));
     findings.push(cameras(Path::new("/dev")));
+    findings.extend(v4l2::cameras().into_iter().flatten().filter_map(|camera| usb(&camera)));
+    findings.extend(can(rig.as_ref()));
     findings.push(port(USUAL_ADDRESS));
     for finding in &findings {
         if args.json {
@@ -236,6 +243,61 @@ fn cameras(dev: &Path) -> Finding {
     Finding::warn("cameras", says, "sudo usermod -aG video $USER, then log in again")
 }
 
+/// What a camera on USB offers and its port cannot carry.
+fn usb(camera: &v4l2::Found) -> Option<Finding> {
+    let carries = format!("{:.1} MB/s", camera.usb_bytes_per_sec()? * 1e-6);
+    let name = format!("{} ({})", camera.name, camera.node.display());
+    let beyond = camera.beyond_usb();
+    if beyond.is_empty() {
+        return Some(Finding::ok("usb", format!("{name}: its port carries {carries}, enough for all that it offers")));
+    }
+    let says = format!("{name}: its port carries {carries} at most, too little for {}", beyond.join(", "));
+    let mend = "choose v4l2.format = \"mjpeg\", a smaller size or a lower rate, or a USB 3 port; `lsusb -t` shows who shares one";
+    Some(Finding::warn("usb", says, mend))
+}
+
+/// How CAN interfaces are set up: those that the rig names as it wants them, the others in themselves.
+#[cfg(target_os = "linux")]
+fn can(rig: Option<&Rig>) -> Vec<Finding> {
+    use drivers::can::{BusConfig, Link, interfaces};
+    let named = rig.map_or(&[][..], |rig| &rig.arm.buses);
+    let others = interfaces().into_iter().filter(|name| !named.iter().any(|bus| bus.interface == *name));
+    let mut findings = Vec::new();
+    for (interface, bus) in
+        named.iter().map(|bus| (bus.interface.clone(), Some(bus))).chain(others.map(|name| (name, None)))
+    {
+        let link = match Link::read(&interface) {
+            Ok(link) => link,
+            Err(error) => {
+                findings.push(Finding::fail("can", error.to_string(), "fieldrig devices lists those that there are"));
+                continue;
+            }
+        };
+        let own = BusConfig {
+            interface,
+            bitrate_hz: link.bitrate_hz.unwrap_or(1_000_000),
+            data_bitrate_hz: link.data_bitrate_hz,
+        };
+        let complaints = link.complaints(bus.unwrap_or(&own));
+        if complaints.is_empty() {
+            findings.push(Finding::ok("can", link.to_string()));
+        }
+        findings.extend(complaints.into_iter().map(|complaint| {
+            let says = format!("{}: {}", link.interface, complaint.what);
+            match bus {
+                Some(_) => Finding::fail("can", says, complaint.command),
+                None => Finding::warn("can", says, complaint.command),
+            }
+        }));
+    }
+    findings
+}
+
+#[cfg(not(target_os = "linux"))]
+fn can(_rig: Option<&Rig>) -> Vec<Finding> {
+    Vec::new()
+}
+
 fn port(address: &str) -> Finding {
     match TcpListener::bind(address) {
         Ok(_) => Finding::ok("network", format!("{address} is free for the page")),
@@ -283,6 +345,26 @@ mod tests {
         let path = "devices/system/clocksource/clocksource0/current_clocksource";
         assert_eq!(clock_source(folder_with(path, "hpet\n").path()).verdict, Verdict::Warn);
         assert_eq!(clock_source(folder_with(path, "tsc\n").path()).verdict, Verdict::Ok);
+    }
+
+    #[test]
+    fn a_port_too_slow_for_its_camera_is_told() {
+        let mut camera = v4l2::Found {
+            node: "/dev/video0".into(),
+            name: "1440p".into(),
+            bus: "usb-1".into(),
+            serial: None,
+            links: Vec::new(),
+            usb_mbits: Some(480.0),
+            modes: vec![v4l2::Mode::new(v4l2::V4l2Format::Yuyv, [2560, 1440], &[30.0])],
+        };
+        let finding = usb(&camera).expect("a camera on USB");
+        assert_eq!(finding.verdict, Verdict::Warn);
+        assert!(finding.says.contains("24.6 MB/s") && finding.says.contains("221 MB/s"), "{}", finding.says);
+        camera.usb_mbits = Some(5000.0);
+        assert_eq!(usb(&camera).expect("a camera on USB").verdict, Verdict::Ok);
+        camera.usb_mbits = None;
+        assert_eq!(usb(&camera), None);
     }
 
     #[test]

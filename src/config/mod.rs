@@ -2,6 +2,7 @@
 //!
 //! Every key is in `docs/rig.md`. Unknown keys are refused, flags override keys of the same name.
 
+mod can;
 mod error;
 mod read;
 mod section;
@@ -13,6 +14,8 @@ pub(crate) use error::ConfigError;
 pub(crate) use write::methods;
 
 use crate::method::Kind;
+use drivers::can::{BusConfig, MotorConfig};
+use drivers::v4l2::{Delivery, V4l2Format};
 use kinematics::{Intrinsics, Transform};
 use std::net::SocketAddr;
 use std::ops::RangeInclusive;
@@ -57,10 +60,18 @@ pub(crate) struct Arm {
     pub(crate) base_link: String,
     pub(crate) flange_link: String,
     pub(crate) max_speed_rad_s: f64,
+    /// How often motors on CAN buses are asked.
+    pub(crate) rate_hz: f64,
+    /// CAN buses.
+    pub(crate) buses: Vec<BusConfig>,
+    /// Motors on them, in the order of `joints`.
+    pub(crate) motors: Vec<MotorConfig>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum ArmDriver {
+    /// The rig has no arm.
+    None,
     Franka,
     Can,
     Udp,
@@ -144,6 +155,7 @@ pub(crate) struct Camera {
     pub(crate) parent_from_camera: Transform,
     pub(crate) intrinsics: Intrinsics,
     pub(crate) depth: Option<Depth>,
+    pub(crate) v4l2: V4l2,
     pub(crate) sim: CameraSim,
 }
 
@@ -153,6 +165,20 @@ pub(crate) enum CameraDriver {
     V4l2,
     Nokhwa,
     Sim,
+}
+
+/// How a camera with the driver `v4l2` is set up, beside its exposure.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct V4l2 {
+    /// `None` takes the best that is offered.
+    pub(crate) format: Option<V4l2Format>,
+    /// Counts of the camera; `None` here and below leaves it to the camera.
+    pub(crate) gain: Option<i32>,
+    pub(crate) brightness: Option<i32>,
+    pub(crate) white_balance_kelvin: Option<i32>,
+    pub(crate) delivery: Delivery,
+    /// How long a camera that was unplugged is looked for.
+    pub(crate) reconnect_secs: f64,
 }
 
 /// The frame that a camera is fixed to.
@@ -175,6 +201,10 @@ pub(crate) struct Measured {
 /// Depth images of a camera.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Depth {
+    /// Where depth is read with the driver `v4l2`; empty where the driver needs none.
+    pub(crate) device: String,
+    /// Metres per count where the device does not tell it.
+    pub(crate) metres_per_count: Option<f64>,
     pub(crate) intrinsics: Intrinsics,
     /// Pose of the depth images' optical frame in that of the colour images.
     pub(crate) camera_from_depth: Transform,

@@ -4,15 +4,22 @@ use super::section::{Reading, Section};
 use super::{
     Arm, ArmDriver, Base, BaseDriver, Camera, CameraDriver, CameraSim, ConfigError, Depth, JoinConfig, MAX_BYTES,
     MAX_SPLATS, Measured, Override, Parent, Rig, SEED, Scanner, ScannerDriver, ScannerSim, Sim, Train, USUAL_SEED,
+    V4l2,
 };
 use crate::method::Kind;
+use drivers::v4l2::{Delivery, V4l2Format};
 use kinematics::{Chain, Intrinsics, Lens, Transform};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use toml::{Table, Value};
 
-pub(super) const ARM_DRIVERS: [(&str, ArmDriver); 4] =
-    [("franka", ArmDriver::Franka), ("can", ArmDriver::Can), ("udp", ArmDriver::Udp), ("sim", ArmDriver::Sim)];
+pub(super) const ARM_DRIVERS: [(&str, ArmDriver); 5] = [
+    ("none", ArmDriver::None),
+    ("franka", ArmDriver::Franka),
+    ("can", ArmDriver::Can),
+    ("udp", ArmDriver::Udp),
+    ("sim", ArmDriver::Sim),
+];
 pub(super) const BASE_DRIVERS: [(&str, BaseDriver); 5] = [
     ("fixed", BaseDriver::Fixed),
     ("tags", BaseDriver::Tags),
@@ -26,6 +33,7 @@ pub(super) const CAMERA_DRIVERS: [(&str, CameraDriver); 4] = [
     ("nokhwa", CameraDriver::Nokhwa),
     ("sim", CameraDriver::Sim),
 ];
+pub(super) const DELIVERIES: [(&str, Delivery); 2] = [("every", Delivery::Every), ("newest", Delivery::Newest)];
 pub(super) const SCANNER_DRIVERS: [(&str, ScannerDriver); 2] =
     [("udp", ScannerDriver::Udp), ("sim", ScannerDriver::Sim)];
 pub(super) const PARENTS: [(&str, Parent); 3] =
@@ -33,6 +41,8 @@ pub(super) const PARENTS: [(&str, Parent); 3] =
 /// Where base poses and range scans are listened for where nothing says otherwise: of this computer only.
 const USUAL_BASE_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7009);
 const USUAL_SCANNER_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7010);
+/// The description of a robot without an arm, where the rig file names none.
+const NO_ROBOT: &str = r#"<robot name="none"><link name="base"/></robot>"#;
 /// Poses and lens coefficients beyond this are slips of the pen.
 const FAR: f64 = 1e4;
 /// Offsets of joints beyond this, rad or m, are not offsets.
@@ -51,7 +61,7 @@ pub(super) fn rig(
     if let Some(problem) = reading.into_problem() {
         return Err(problem);
     }
-    rig.arm.urdf_text = read_urdf(&urdf_path)?;
+    rig.arm.urdf_text = if urdf_path.is_empty() { NO_ROBOT.to_owned() } else { read_urdf(&urdf_path)? };
     settle_joints(file, &mut rig.arm)?;
     Ok(rig)
 }
@@ -105,6 +115,7 @@ fn settle_joints(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
         arm.joints = chain.joint_names().to_vec();
     }
     chain.order_in(&arm.joints).map_err(|e| robot("arm.joints", e))?;
+    settle_motors(file, arm)?;
     let (n, n_joints) = (arm.joint_offsets.len(), arm.joints.len());
     if n == 0 || (n == n_joints && arm.joint_offsets.iter().all(|offset| offset.abs() <= MOST_OFFSET)) {
         return Ok(());
@@ -113,19 +124,41 @@ fn settle_joints(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
     Err(ConfigError::Robot { file: file.to_owned(), key: "arm.joint_offsets", reason })
 }
 
+/// Brings the motors into the order of the joints; an arm on CAN buses has one for each, and none besides.
+fn settle_motors(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
+    if arm.driver != ArmDriver::Can {
+        return Ok(());
+    }
+    let problem = |reason| ConfigError::Robot { file: file.to_owned(), key: "arm.motor", reason };
+    let place = |name: &String| arm.joints.iter().position(|joint| joint == name);
+    if let Some(lost) = arm.motors.iter().find(|motor| place(&motor.joint).is_none()) {
+        return Err(problem(format!("{:?} is none of the joints {}", lost.joint, arm.joints.join(", "))));
+    }
+    if let Some(joint) = arm.joints.iter().find(|joint| !arm.motors.iter().any(|motor| motor.joint == **joint)) {
+        return Err(problem(format!("the joint {joint:?} has no table [arm.motor.{joint}]")));
+    }
+    let mut motors = std::mem::take(&mut arm.motors);
+    motors.sort_by_key(|motor| place(&motor.joint));
+    arm.motors = motors;
+    Ok(())
+}
+
 fn arm(mut keys: Section<'_>) -> (Arm, String) {
     let driver = keys.choice("driver", &ARM_DRIVERS);
     if driver.is_none() {
-        keys.missing("driver", "franka, can, udp or sim");
+        keys.missing("driver", "none, franka, can, udp or sim");
     }
+    let has_arm = driver != Some(ArmDriver::None);
     let urdf = keys.text("urdf");
-    if urdf.is_none() {
+    if urdf.is_none() && has_arm {
         keys.missing("urdf", "path of the robot's description, relative to the rig file");
     }
-    let flange_link = keys.text("flange_link");
+    // Without an arm and its description there is one link.
+    let flange_link = keys.text("flange_link").or_else(|| (!has_arm && urdf.is_none()).then(|| "base".to_owned()));
     if flange_link.is_none() {
         keys.missing("flange_link", "the link that cameras with the parent flange are fixed to");
     }
+    let (buses, motors) = super::can::read(&mut keys);
     let arm = Arm {
         driver: driver.unwrap_or(ArmDriver::Sim),
         address: keys.text("address").unwrap_or_default(),
@@ -135,6 +168,9 @@ fn arm(mut keys: Section<'_>) -> (Arm, String) {
         base_link: keys.text("base_link").unwrap_or_default(),
         flange_link: flange_link.unwrap_or_default(),
         max_speed_rad_s: keys.number("max_speed_rad_s", 0.0..=10.0).unwrap_or(0.5),
+        rate_hz: keys.number("rate_hz", 1.0..=2000.0).unwrap_or(200.0),
+        buses,
+        motors,
     };
     keys.end();
     (arm, urdf.unwrap_or_default())
@@ -241,6 +277,7 @@ fn camera(name: &str, mut keys: Section<'_>) -> Camera {
         parent: parent.unwrap_or(Parent::Flange),
         parent_from_camera: pose(&mut keys, "parent_from_camera").unwrap_or_else(Transform::identity),
         depth: keys.optional_section("depth").map(|keys| depth(keys, &intrinsics)),
+        v4l2: v4l2(keys.section("v4l2")),
         sim: camera_sim(keys.section("sim")),
         intrinsics,
     };
@@ -319,6 +356,8 @@ fn depth(mut keys: Section<'_>, color: &Intrinsics) -> Depth {
     });
     let min_m = keys.number("min_m", 0.0..=100.0).unwrap_or(0.1);
     let depth = Depth {
+        device: keys.text("device").unwrap_or_default(),
+        metres_per_count: keys.number("metres_per_count", 1e-6..=0.1),
         intrinsics,
         camera_from_depth: pose(&mut keys, "camera_from_depth").unwrap_or_else(Transform::identity),
         factor: keys.number("factor", 0.5..=2.0).unwrap_or(1.0),
@@ -327,6 +366,22 @@ fn depth(mut keys: Section<'_>, color: &Intrinsics) -> Depth {
     };
     keys.end();
     depth
+}
+
+fn v4l2(mut keys: Section<'_>) -> V4l2 {
+    // Counts of controls are 32 bits wide; what a camera takes of them it tells when it is opened.
+    let counts = |number: i64| i32::try_from(number).expect("the range was checked");
+    const ANY: std::ops::RangeInclusive<i64> = -1_000_000..=1_000_000;
+    let v4l2 = V4l2 {
+        format: keys.choice("format", &V4l2Format::OF_COLOR),
+        gain: keys.integer("gain", ANY).map(counts),
+        brightness: keys.integer("brightness", ANY).map(counts),
+        white_balance_kelvin: keys.integer("white_balance_kelvin", 1000..=20_000).map(counts),
+        delivery: keys.choice("delivery", &DELIVERIES).unwrap_or(Delivery::Every),
+        reconnect_secs: keys.number("reconnect_secs", 0.0..=86_400.0).unwrap_or(30.0),
+    };
+    keys.end();
+    v4l2
 }
 
 fn camera_sim(mut keys: Section<'_>) -> CameraSim {

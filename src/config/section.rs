@@ -175,6 +175,15 @@ impl<'a> Section<'a> {
         }
     }
 
+    /// A whole number that may be negative, within a range, if the key is there.
+    pub(super) fn integer(&mut self, key: &'static str, range: RangeInclusive<i64>) -> Option<i64> {
+        let value = self.take(key)?;
+        match value.as_integer().filter(|number| range.contains(number)) {
+            Some(number) => Some(number),
+            None => self.wrong(key, &value, &format!("whole numbers from {} to {}", range.start(), range.end())),
+        }
+    }
+
     /// `true` or `false`, if the key is there.
     pub(super) fn flag(&mut self, key: &'static str) -> Option<bool> {
         let value = self.take(key)?;

@@ -37,6 +37,24 @@ intrinsics = { focal_px = [300, 300], principal_px = [160.0, 120.0], lens = "bro
 [range.lidar]
 driver = "udp"
 [range.lidar.sim]
+[camera.wrist.v4l2]
+[arm.bus.can0]
+[arm.bus.can1]
+[arm.motor.first]
+family = "damiao"
+bus = "can0"
+id = 1
+feedback_id = 17
+[arm.motor.second]
+family = "robstride"
+bus = "can0"
+id = 2
+model = "rs02"
+[arm.motor.third]
+family = "cia402"
+bus = "can0"
+id = 3
+counts_per_turn = 65536
 "#;
 
 fn parse(text: &str, overrides: &[Override]) -> Result<Rig, ConfigError> {
@@ -49,8 +67,24 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a good value that differs from the one in force, and a value that is not allowed.
-const KEYS: [(&str, &str, &str); 109] = [
+const KEYS: [(&str, &str, &str); 133] = [
+    ("arm.rate_hz", "500", "0"),
+    ("arm.bus.can0.bitrate_hz", "500_000", "1"),
+    ("arm.bus.can0.data_bitrate_hz", "5_000_000", "9_000_000"),
+    ("arm.motor.first", "{ family = 'odrive', bus = 'can0', id = 1 }", "{ family = 'odrive', bus = 'can0', id = 63 }"),
+    ("arm.motor.first", "{ family = 'tmotor', bus = 'can0', id = 1, model = 'ak80-64' }", "{ bus = 'can0', id = 1 }"),
+    ("arm.motor.first.family", "'damiao'", "'dynamixel'"),
+    ("arm.motor.first.bus", "'can1'", "'can2'"),
+    ("arm.motor.first.id", "9", "2047"),
+    ("arm.motor.first.feedback_id", "18", "-1"),
+    ("arm.motor.second.model", "'rs03'", "'ak80-9'"),
+    ("arm.motor.third.counts_per_turn", "4096", "0"),
+    ("arm.motor.third.rated_torque_nm", "12.5", "-1"),
+    ("arm.motor.third.gear_ratio", "50", "0"),
+    ("arm.motor.third.reversed", "true", "-1"),
+    ("arm.motor.third.offset_rad", "-0.5", "'left'"),
     ("arm.driver", "'franka'", "'frankka'"),
+    ("arm.driver", "'none'", "'nothing'"),
     ("arm.address", "'172.16.0.2'", "7"),
     ("arm.urdf", "'other.urdf'", "7"),
     ("arm.joints", "['j2', 'j1']", "['j1', 'j9']"),
@@ -96,6 +130,14 @@ const KEYS: [(&str, &str, &str); 109] = [
     ("camera.wrist.intrinsics.lens", "'pinhole'", "'fisheye'"),
     ("camera.wrist.intrinsics.distortion", "[0, 0, 0, 0, 0.1]", "[0.1]"),
     ("camera.wrist.rectified", "true", "1"),
+    ("camera.wrist.v4l2.format", "'mjpeg'", "'h264'"),
+    ("camera.wrist.v4l2.gain", "12", "1.5"),
+    ("camera.wrist.v4l2.brightness", "-12", "'bright'"),
+    ("camera.wrist.v4l2.white_balance_kelvin", "4600", "46"),
+    ("camera.wrist.v4l2.delivery", "'newest'", "'some'"),
+    ("camera.wrist.v4l2.reconnect_secs", "5", "-1"),
+    ("camera.wrist.depth.device", "'/dev/video9'", "9"),
+    ("camera.wrist.depth.metres_per_count", "0.001", "0"),
     ("camera.wrist.depth.size_px", "[640, 480]", "[4, 4]"),
     ("camera.wrist.depth.intrinsics.focal_px", "[301, 300]", "[300]"),
     ("camera.wrist.depth.intrinsics.principal_px", "[161, 120]", "160"),
@@ -168,8 +210,10 @@ fn every_key_takes_effect_and_refuses_what_is_not_allowed() {
     let mut wrong = Vec::new();
     for (key, good, bad) in KEYS {
         match with(key, good) {
-            // The path of the robot's description is read, not kept.
-            Ok(changed) if changed == rig && key != "arm.urdf" => wrong.push(format!("{key} = {good} changes nothing")),
+            // The path of the robot's description is read, not kept; another family needs other keys too.
+            Ok(changed) if changed == rig && !["arm.urdf", "arm.motor.first.family"].contains(&key) => {
+                wrong.push(format!("{key} = {good} changes nothing"))
+            }
             Ok(_) => {}
             Err(e) => wrong.push(format!("{key} = {good} is refused: {e}")),
         }
@@ -212,7 +256,14 @@ fn the_documentation_lists_exactly_the_keys_there_are() {
     assert_eq!(known.difference(&listed).collect::<Vec<_>>(), Vec::<&String>::new(), "read, but not documented");
     let tested: BTreeSet<String> = KEYS
         .iter()
-        .map(|(key, ..)| key.replace("camera.wrist", "camera.NAME").replace("range.lidar", "range.NAME"))
+        .map(|(key, ..)| {
+            let names = ["camera.wrist", "range.lidar", "arm.bus.can0"];
+            let motors = ["arm.motor.first", "arm.motor.second", "arm.motor.third"];
+            names.iter().chain(&motors).fold((*key).to_owned(), |key, named| {
+                let (table, _) = named.rsplit_once('.').expect("two parts");
+                key.replace(named, &format!("{table}.NAME"))
+            })
+        })
         .collect();
     assert_eq!(known.difference(&tested).collect::<Vec<_>>(), Vec::<&String>::new(), "read, but not tested above");
     for (key, line) in documented {
@@ -325,4 +376,27 @@ fn a_pinhole_with_coefficients_is_refused_and_one_with_zeros_is_not() {
         message.contains("camera.wrist.intrinsics.distortion") && message.contains("lens = \"pinhole\""),
         "{message}"
     );
+}
+
+#[test]
+fn an_arm_on_can_buses_has_a_motor_for_each_joint() {
+    let rig = |joints: [&str; 2]| {
+        let [first, second] = joints;
+        let text = format!(
+            "[arm]\ndriver = \"can\"\nurdf = \"two.urdf\"\nflange_link = \"c\"\n[arm.bus.can0]\n\
+             [arm.motor.{first}]\nfamily = \"damiao\"\nbus = \"can0\"\nid = 2\nfeedback_id = 18\n\
+             [arm.motor.{second}]\nfamily = \"odrive\"\nbus = \"can0\"\nid = 1\n\
+             [camera.front]\ndriver = \"sim\"\nsize_px = [640, 480]\nrate_hz = 30\nparent = \"base\"\n\
+             intrinsics = {{ focal_px = [600, 600], principal_px = [320, 240] }}\n"
+        );
+        parse(&text, &[Override::new("arm.joints", Value::from(vec!["j2", "j1"]))])
+    };
+    let good = rig(["j1", "j2"]).expect("a motor for each joint");
+    assert_eq!(good.arm.motors.iter().map(|motor| motor.joint.as_str()).collect::<Vec<_>>(), ["j2", "j1"]);
+    let refused = rig(["j1", "j3"]).expect_err("no such joint").to_string();
+    assert!(refused.contains("\"j3\" is none of the joints j2, j1"), "{refused}");
+    let refused = with("arm.driver", "'can'").expect_err("no motors for its joints").to_string();
+    assert!(refused.contains("arm.motor"), "{refused}");
+    let foreign = with("arm.motor.first.model", "'rs01'").expect_err("Damiao motors tell it themselves").to_string();
+    assert!(foreign.contains("arm.motor.first.model"), "{foreign}");
 }

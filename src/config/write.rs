@@ -1,7 +1,7 @@
 //! The settled rig file: every key of a checked rig, written so that reading it gives the same rig.
 
-use super::read::{ARM_DRIVERS, BASE_DRIVERS, CAMERA_DRIVERS, PARENTS, SCANNER_DRIVERS};
-use super::{Arm, Base, Camera, CameraSim, Depth, JoinConfig, Rig, Scanner, Sim, Train};
+use super::read::{ARM_DRIVERS, BASE_DRIVERS, CAMERA_DRIVERS, DELIVERIES, PARENTS, SCANNER_DRIVERS};
+use super::{Arm, Base, Camera, CameraSim, Depth, JoinConfig, Rig, Scanner, Sim, Train, V4l2};
 use crate::method::Kind;
 use kinematics::{Intrinsics, Lens, Transform};
 use toml::{Table, Value};
@@ -24,24 +24,25 @@ pub(super) fn rig(rig: &Rig) -> String {
 }
 
 /// A table of the keys that have a value.
-fn table<const N: usize>(entries: [(&str, Option<Value>); N]) -> Table {
+pub(super) fn table<const N: usize>(entries: [(&str, Option<Value>); N]) -> Table {
     entries.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))).collect()
 }
 
-fn is(value: impl Into<Value>) -> Option<Value> {
+pub(super) fn is(value: impl Into<Value>) -> Option<Value> {
     Some(value.into())
 }
 
-fn whole(number: u64) -> Option<Value> {
+pub(super) fn whole(number: u64) -> Option<Value> {
     // Larger numbers cannot come from a rig file.
     is(i64::try_from(number).unwrap_or(i64::MAX))
 }
 
-fn name_of<T: PartialEq>(choices: &[(&'static str, T)], choice: &T) -> Option<Value> {
+pub(super) fn name_of<T: PartialEq>(choices: &[(&'static str, T)], choice: &T) -> Option<Value> {
     choices.iter().find(|(_, candidate)| candidate == choice).map(|(name, _)| Value::from(*name))
 }
 
 fn arm(arm: &Arm) -> Table {
+    let [buses, motors] = super::can::write(&arm.buses, &arm.motors);
     table([
         ("driver", name_of(&ARM_DRIVERS, &arm.driver)),
         ("address", is(arm.address.as_str())),
@@ -51,6 +52,9 @@ fn arm(arm: &Arm) -> Table {
         ("base_link", is(arm.base_link.as_str())),
         ("flange_link", is(arm.flange_link.as_str())),
         ("max_speed_rad_s", is(arm.max_speed_rad_s)),
+        ("rate_hz", is(arm.rate_hz)),
+        ("bus", buses),
+        ("motor", motors),
     ])
 }
 
@@ -106,13 +110,27 @@ fn camera(camera: &Camera) -> Table {
         ("parent_from_camera", pose(&camera.parent_from_camera)),
         ("intrinsics", intrinsics(&camera.intrinsics)),
         ("rectified", is(camera.intrinsics.rectified)),
+        ("v4l2", Some(Value::Table(v4l2(&camera.v4l2)))),
         ("depth", camera.depth.as_ref().map(|depth| Value::Table(self::depth(depth)))),
         ("sim", Some(Value::Table(camera_sim(&camera.sim)))),
     ])
 }
 
+fn v4l2(v4l2: &V4l2) -> Table {
+    table([
+        ("format", v4l2.format.map(|format| Value::from(format.name()))),
+        ("gain", v4l2.gain.map(Value::from)),
+        ("brightness", v4l2.brightness.map(Value::from)),
+        ("white_balance_kelvin", v4l2.white_balance_kelvin.map(Value::from)),
+        ("delivery", name_of(&DELIVERIES, &v4l2.delivery)),
+        ("reconnect_secs", is(v4l2.reconnect_secs)),
+    ])
+}
+
 fn depth(depth: &Depth) -> Table {
     table([
+        ("device", is(depth.device.as_str())),
+        ("metres_per_count", depth.metres_per_count.map(Value::from)),
         ("size_px", size_px(depth.intrinsics.size_px)),
         ("intrinsics", intrinsics(&depth.intrinsics)),
         ("rectified", is(depth.intrinsics.rectified)),

@@ -6,13 +6,16 @@ mod simulated;
 #[cfg(all(test, feature = "sim"))]
 mod simulated_tests;
 
-use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Rig, ScannerDriver};
+use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Override, Parent, Rig, ScannerDriver};
 use anyhow::{Context, bail};
 use drivers::recording::{About, RIG_FILE, Recorder, Recording, URDF_FILE};
-use drivers::{Error, Sample, Source};
+use drivers::{Error, Live, Sample, Source};
 use kinematics::Chain;
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
+
+/// What helps where a device is not there.
+const WAY_OUT: &str = "--sim replaces every device by its simulated twin";
 
 /// Which devices a rig file stands for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -45,9 +48,11 @@ pub(crate) fn rig(mut rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
         }
     }
     if let Some(device) = absent_device(&rig) {
-        bail!("{device} cannot be opened by this version; --sim replaces every device by its simulated twin");
+        bail!("{device} cannot be opened by this version; {WAY_OUT}");
     }
-    let source = simulate(&rig, real::open(&rig)?)?;
+    check_arm(&rig)?;
+    let real = real::open(&rig).context(WAY_OUT)?;
+    let source = if is_any_simulated(&rig) { simulate(&rig, real)? } else { Box::new(Live::new(real)?) };
     Ok(Opened { rig, source, damage: Arc::default() })
 }
 
@@ -98,15 +103,36 @@ fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> any
     Ok(Rig::parse(RIG_FILE, text(RIG_FILE)?, text(URDF_FILE)?, overrides)?)
 }
 
+/// A flange needs joint readings to be anywhere.
+fn check_arm(rig: &Rig) -> anyhow::Result<()> {
+    let on_flange = rig.cameras.iter().find(|camera| camera.parent == Parent::Flange);
+    if let (ArmDriver::None, Some(camera)) = (rig.arm.driver, on_flange) {
+        bail!(
+            "camera {:?} has the parent flange, and arm.driver is none: its parent must be base or world",
+            camera.name
+        );
+    }
+    Ok(())
+}
+
+/// Whether anything of a rig is simulated.
+fn is_any_simulated(rig: &Rig) -> bool {
+    rig.arm.driver == ArmDriver::Sim
+        || rig.base.driver == BaseDriver::Sim
+        || rig.cameras.iter().any(|camera| camera.driver == CameraDriver::Sim)
+        || rig.scanners.iter().any(|scanner| scanner.driver == ScannerDriver::Sim)
+}
+
 /// The first device of a rig that has no driver yet.
 fn absent_device(rig: &Rig) -> Option<String> {
-    if rig.arm.driver != ArmDriver::Sim {
+    if !matches!(rig.arm.driver, ArmDriver::Sim | ArmDriver::Can | ArmDriver::None) {
         return Some(format!("arm driver {:?}", format!("{:?}", rig.arm.driver).to_lowercase()));
     }
     if matches!(rig.base.driver, BaseDriver::Tags | BaseDriver::Rgbd) {
         return Some(format!("base driver {:?}", format!("{:?}", rig.base.driver).to_lowercase()));
     }
-    let camera = rig.cameras.iter().find(|camera| camera.driver != CameraDriver::Sim)?;
+    let has_none = |camera: &&Camera| matches!(camera.driver, CameraDriver::Realsense | CameraDriver::Nokhwa);
+    let camera = rig.cameras.iter().find(has_none)?;
     Some(format!("camera {:?} with driver {:?}", camera.name, format!("{:?}", camera.driver).to_lowercase()))
 }
 
@@ -169,6 +195,32 @@ mod tests {
             let message = format!("{:#}", super::rig(rig, Devices::Real).err().expect("no such driver"));
             assert!(message.contains(named) && message.contains("--sim"), "{message}");
         }
+    }
+
+    #[test]
+    fn a_v4l2_camera_that_is_not_there_or_hangs_on_nothing_is_an_error() {
+        let absent = [
+            Override::new("arm.driver", "none"),
+            Override::new("camera.wrist.driver", "v4l2"),
+            Override::new("camera.wrist.device", "no such serial"),
+            Override::new("camera.wrist.depth.device", "no such serial"),
+            Override::new("camera.wrist.depth.metres_per_count", 0.001),
+        ];
+        let refused = |overrides: &[Override]| {
+            let opened = super::rig(load("static-arm.toml", overrides), Devices::Real);
+            format!("{:#}", opened.err().expect("nothing is plugged in"))
+        };
+        let message = refused(&absent);
+        assert!(message.contains("\"wrist\" has the parent flange"), "{message}");
+        let standing = [&absent[..], &[Override::new("camera.wrist.parent", "base")]].concat();
+        let message = refused(&standing);
+        assert!(
+            message.contains("no V4L2 camera goes by \"no such serial\"") && message.contains("--sim"),
+            "{message}"
+        );
+        let without_scale = [&standing[..3], &standing[5..]].concat();
+        let message = refused(&without_scale);
+        assert!(message.contains("camera.wrist.depth.device"), "{message}");
     }
 
     #[test]

@@ -1,12 +1,26 @@
 //! The devices of a rig that are not simulated.
 
-use crate::config::{BaseDriver, Rig, ScannerDriver};
+use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Depth, Rig, ScannerDriver};
+use anyhow::bail;
+#[cfg(target_os = "linux")]
+use drivers::can::{ArmConfig, CanArm};
 use drivers::udp::{UdpBase, UdpScanner};
-use drivers::{Base, Devices, Error, RangeScanner};
+use drivers::v4l2::{Config, Settings, V4l2Camera, V4l2Format};
+use drivers::{Arm, Base, Devices, RangeScanner};
+use std::time::Duration;
 
 /// Opens them; a rig may have none.
-pub(super) fn open(rig: &Rig) -> Result<Devices, Error> {
+pub(super) fn open(rig: &Rig) -> anyhow::Result<Devices> {
     let mut devices = Devices::default();
+    for camera in rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::V4l2) {
+        let depth = camera.depth.as_ref().map(|depth| v4l2_depth(camera, depth)).transpose()?;
+        for config in std::iter::once(v4l2_color(camera)).chain(depth) {
+            devices.cameras.push(Box::new(V4l2Camera::open(config)?));
+        }
+    }
+    if rig.arm.driver == ArmDriver::Can {
+        devices.arm = Some(can_arm(rig)?);
+    }
     if rig.base.driver == BaseDriver::Udp {
         let base = UdpBase::open(rig.base.address)?;
         log::info!("base: listening on {}", base.address());
@@ -18,4 +32,55 @@ pub(super) fn open(rig: &Rig) -> Result<Devices, Error> {
         devices.scanners.push(Box::new(open) as Box<dyn RangeScanner>);
     }
     Ok(devices)
+}
+
+/// An arm whose joints are motors on CAN buses.
+#[cfg(target_os = "linux")]
+fn can_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
+    let Rig { arm, .. } = rig;
+    let config = ArmConfig { buses: arm.buses.clone(), motors: arm.motors.clone(), rate_hz: arm.rate_hz };
+    Ok(Box::new(CanArm::open(&config)?))
+}
+
+#[cfg(not(target_os = "linux"))]
+fn can_arm(_rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
+    bail!("arms on CAN buses are read on Linux only")
+}
+
+/// The color images of a camera.
+fn v4l2_color(camera: &Camera) -> Config {
+    Config {
+        name: camera.name.to_string(),
+        device: camera.device.clone(),
+        format: camera.v4l2.format,
+        intrinsics: camera.intrinsics.clone(),
+        rate_hz: camera.rate_hz,
+        metres_per_count: None,
+        settings: Settings {
+            exposure_micros: camera.exposure_micros,
+            gain: camera.v4l2.gain,
+            white_balance_kelvin: camera.v4l2.white_balance_kelvin,
+            brightness: camera.v4l2.brightness,
+        },
+        delivery: camera.v4l2.delivery,
+        reconnect_for: Duration::from_secs_f64(camera.v4l2.reconnect_secs),
+    }
+}
+
+/// The depth images of a camera, which come from a device of their own; its exposure is left to itself.
+fn v4l2_depth(camera: &Camera, depth: &Depth) -> anyhow::Result<Config> {
+    let Some(metres_per_count) = depth.metres_per_count.filter(|_| !depth.device.is_empty()) else {
+        let name = &camera.name;
+        bail!(
+            "camera {name:?}: depth by V4L2 needs camera.{name}.depth.device and camera.{name}.depth.metres_per_count"
+        );
+    };
+    Ok(Config {
+        device: depth.device.clone(),
+        format: Some(V4l2Format::Z16),
+        intrinsics: depth.intrinsics.clone(),
+        metres_per_count: Some(metres_per_count),
+        settings: Settings::default(),
+        ..v4l2_color(camera)
+    })
 }

@@ -1,6 +1,6 @@
 //! A rig's simulated twin: the same cameras and joints in MuJoCo.
 
-use crate::config::{BaseDriver, Camera, Parent, Rig, Scanner, ScannerDriver};
+use crate::config::{BaseDriver, Camera, CameraDriver, Parent, Rig, Scanner, ScannerDriver};
 use anyhow::bail;
 use drivers::{Devices, Error, Live, Sample, Source};
 use kinematics::{Stamp, Transform};
@@ -9,12 +9,10 @@ use std::sync::Arc;
 /// Opens the simulated rig, in lockstep or in real time as the rig file says; `real` devices deliver beside it in real time.
 pub(super) fn open(rig: &Rig, real: Devices) -> anyhow::Result<Box<dyn Source>> {
     let mut config = config_of(rig)?;
-    let any_real = real.base.is_some() || !real.scanners.is_empty();
+    let any_real = real.base.is_some() || !real.scanners.is_empty() || !real.cameras.is_empty();
     if rig.sim.lockstep {
         if any_real {
-            bail!(
-                "with sim.lockstep the simulation waits for whoever takes its samples, which devices with the driver udp do not"
-            );
+            bail!("with sim.lockstep the simulation waits for whoever takes its samples, which real devices do not");
         }
         return Ok(Box::new(sim::open(&config)?.into_lockstep()));
     }
@@ -25,6 +23,7 @@ pub(super) fn open(rig: &Rig, real: Devices) -> anyhow::Result<Box<dyn Source>> 
     let sim::LiveRig { mut devices, truth, .. } = sim::open(&config)?.into_live(start)?;
     devices.base = devices.base.or(real.base);
     devices.scanners.extend(real.scanners);
+    devices.cameras.extend(real.cameras);
     Ok(Box::new(RealTime {
         live: Live::new(devices)?,
         truth,
@@ -92,7 +91,7 @@ fn config_of(rig: &Rig) -> anyhow::Result<sim::Config> {
         scanners: rig.scanners.iter().filter(|scanner| scanner.driver == ScannerDriver::Sim).map(scanner_of).collect(),
         base: sim::BaseConfig { rate_hz: rig.base.rate_hz, drift_m: rig.base.drift_m, drift_rad: rig.base.drift_rad },
         light_inside_frac: rig.sim.light_inside_frac,
-        cameras: rig.cameras.iter().map(camera_of).collect(),
+        cameras: rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::Sim).map(camera_of).collect(),
     })
 }
 

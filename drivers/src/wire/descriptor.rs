@@ -105,6 +105,7 @@ pub const RAW_IMAGE: Schema = Schema {
         field("exposure_secs", 1001, Kind::Double),
         field("n_skipped", 1002, Kind::Uint64),
         field("metres_per_count", 1005, Kind::Double),
+        field("yuv_colors", 1007, Kind::Text),
     ],
     needs: &[&TIMESTAMP],
     enums: &[],

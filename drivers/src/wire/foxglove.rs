@@ -5,7 +5,7 @@
 
 use super::protobuf::{Field, Message, fields};
 use super::{Malformed, descriptor};
-use crate::{Image, PixelFormat};
+use crate::{Image, PixelFormat, YuvColors, YuvLayout, YuvMatrix, YuvRange};
 use kinematics::{Intrinsics, Lens, Stamp, Transform};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use std::sync::Arc;
@@ -16,13 +16,33 @@ const WIDTH_PX: u32 = 1003;
 const HEIGHT_PX: u32 = 1004;
 const METRES_PER_COUNT: u32 = 1005;
 const PSNR_CEILING: u32 = 1006;
+const YUV_COLORS: u32 = 1007;
+/// Values of that field.
+const YUV_COLORS_NAMES: [(&str, YuvColors); 4] = [
+    ("bt601-limited", YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited }),
+    ("bt601-full", YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Full }),
+    ("bt709-limited", YuvColors { matrix: YuvMatrix::Bt709, range: YuvRange::Limited }),
+    ("bt709-full", YuvColors { matrix: YuvMatrix::Bt709, range: YuvRange::Full }),
+];
+/// Foxglove's names of layouts: written is the first of a layout, read are all.
+const YUV_LAYOUTS: [(&str, YuvLayout); 5] = [
+    ("yuyv", YuvLayout::Yuyv),
+    ("uyvy", YuvLayout::Uyvy),
+    ("nv12", YuvLayout::Nv12),
+    ("yuv422_yuy2", YuvLayout::Yuyv),
+    ("yuv422", YuvLayout::Uyvy),
+];
 const NANOS_PER_SEC: i64 = 1_000_000_000;
 
 /// Which message carries images of this format.
 pub fn schema_of(format: PixelFormat) -> descriptor::Schema {
     match format {
         PixelFormat::Jpeg | PixelFormat::Png => descriptor::COMPRESSED_IMAGE,
-        PixelFormat::Rgb8 | PixelFormat::Gray8 | PixelFormat::DepthU16 { .. } => descriptor::RAW_IMAGE,
+        PixelFormat::Rgb8
+        | PixelFormat::Bgr8
+        | PixelFormat::Gray8
+        | PixelFormat::Yuv { .. }
+        | PixelFormat::DepthU16 { .. } => descriptor::RAW_IMAGE,
     }
 }
 
@@ -36,10 +56,15 @@ pub fn encode_image(image: &Image) -> Vec<u8> {
             message.bytes(2, &image.data).bytes(3, format).bytes(4, image.camera.as_bytes());
             message.fixed32(WIDTH_PX, image.size_px[0]).fixed32(HEIGHT_PX, image.size_px[1]);
         }
-        PixelFormat::Rgb8 => raw_image(&mut message, image, "rgb8", 3),
-        PixelFormat::Gray8 => raw_image(&mut message, image, "mono8", 1),
+        PixelFormat::Rgb8 => raw_image(&mut message, image, "rgb8"),
+        PixelFormat::Bgr8 => raw_image(&mut message, image, "bgr8"),
+        PixelFormat::Gray8 => raw_image(&mut message, image, "mono8"),
+        PixelFormat::Yuv { layout, colors } => {
+            raw_image(&mut message, image, name_of(&YUV_LAYOUTS, layout));
+            message.bytes(YUV_COLORS, name_of(&YUV_COLORS_NAMES, colors).as_bytes());
+        }
         PixelFormat::DepthU16 { metres_per_count } => {
-            raw_image(&mut message, image, "16UC1", 2);
+            raw_image(&mut message, image, "16UC1");
             message.double(METRES_PER_COUNT, metres_per_count);
         }
     }
@@ -50,10 +75,20 @@ pub fn encode_image(image: &Image) -> Vec<u8> {
     message.into_bytes()
 }
 
-fn raw_image(message: &mut Message, image: &Image, encoding: &str, bytes_per_pixel: u32) {
+/// The first name of a value in a table that has them all.
+fn name_of<T: PartialEq>(names: &[(&'static str, T)], value: T) -> &'static str {
+    names.iter().find(|(_, named)| *named == value).expect("the table names every value").0
+}
+
+fn named<T: Copy>(names: &[(&str, T)], name: &str) -> Option<T> {
+    names.iter().find(|(known, _)| *known == name).map(|(_, value)| *value)
+}
+
+fn raw_image(message: &mut Message, image: &Image, encoding: &str) {
+    let row_bytes = image.format.raw_size(image.size_px).map_or(0, |[row_bytes, _]| row_bytes);
     message.fixed32(2, image.size_px[0]).fixed32(3, image.size_px[1]).bytes(4, encoding.as_bytes());
     message
-        .fixed32(5, image.size_px[0].saturating_mul(bytes_per_pixel))
+        .fixed32(5, u32::try_from(row_bytes).unwrap_or(u32::MAX))
         .bytes(6, &image.data)
         .bytes(7, image.camera.as_bytes());
 }
@@ -65,6 +100,7 @@ pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
     let mut size_px = [0; 2];
     let mut format = "";
     let mut metres_per_count = None;
+    let mut colors = None;
     let mut image = Image {
         camera: Arc::from(""),
         stamp: Stamp::default(),
@@ -85,6 +121,7 @@ pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
             (HEIGHT_PX, true) | (3, false) => size_px[1] = field.fixed32()?,
             (EXPOSURE_SECS, _) => image.exposure_secs = Some(field.double()?),
             (N_SKIPPED, _) => image.n_skipped = field.varint()?,
+            (YUV_COLORS, false) => colors = Some(field.text()?),
             (METRES_PER_COUNT, false) => metres_per_count = Some(field.double()?),
             _ => {} // A newer writer may know more.
         }
@@ -95,13 +132,22 @@ pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
         ("jpeg", true) => PixelFormat::Jpeg,
         ("png", true) => PixelFormat::Png,
         ("rgb8", false) => PixelFormat::Rgb8,
+        ("bgr8", false) => PixelFormat::Bgr8,
         ("mono8", false) => PixelFormat::Gray8,
         ("16UC1", false) => PixelFormat::DepthU16 {
             metres_per_count: metres_per_count.ok_or(Malformed::Missing { name: "metres_per_count" })?,
         },
-        _ => return Err(Malformed::PixelFormat { name: format.to_owned() }),
+        (name, compressed) => match named(&YUV_LAYOUTS, name) {
+            Some(layout) if !compressed => PixelFormat::Yuv { layout, colors: yuv_colors(colors)? },
+            _ => return Err(Malformed::PixelFormat { name: name.to_owned() }),
+        },
     };
     Ok(image)
+}
+
+fn yuv_colors(name: Option<&str>) -> Result<YuvColors, Malformed> {
+    let name = name.ok_or(Malformed::Missing { name: "yuv_colors" })?;
+    named(&YUV_COLORS_NAMES, name).ok_or_else(|| Malformed::PixelFormat { name: name.to_owned() })
 }
 
 /// Depth in metres as a `RawImage` of 32-bit floats.
@@ -264,7 +310,11 @@ mod tests {
     #[test]
     fn images_come_back_bit_for_bit_in_every_format() {
         let depth = PixelFormat::DepthU16 { metres_per_count: 0.1 + 0.2 };
-        for format in [PixelFormat::Rgb8, PixelFormat::Gray8, PixelFormat::Jpeg, PixelFormat::Png, depth] {
+        let plain = [PixelFormat::Rgb8, PixelFormat::Bgr8, PixelFormat::Gray8, PixelFormat::Jpeg, PixelFormat::Png];
+        let yuv = [YuvLayout::Yuyv, YuvLayout::Uyvy, YuvLayout::Nv12]
+            .into_iter()
+            .flat_map(|layout| YUV_COLORS_NAMES.map(|(_, colors)| PixelFormat::Yuv { layout, colors }));
+        for format in plain.into_iter().chain(yuv).chain([depth]) {
             for exposure_secs in [Some(0.0), None] {
                 for stamp in [Stamp(0), Stamp(-1), Stamp(i64::MAX), Stamp(-1_500_000_000), Stamp(999_999_999)] {
                     let sent = Image { exposure_secs, stamp, ..image(format) };

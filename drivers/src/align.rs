@@ -1,0 +1,484 @@
+//! Depth images in the pixels of the colour camera beside the depth camera.
+//!
+//! Source: the processing block `align` of librealsense (`src/proc/align.cpp`), by idea: a depth pixel is a square whose two
+//! opposite corners go to the colour image at the pixel's depth, and the nearest of all that cover a colour pixel stays. We keep
+//! the part inside the image of a square that reaches over the edge, where librealsense drops the square. Its SSE path
+//! (`src/proc/sse/sse-align.cpp`) rounds half a pixel further to the right and down, and takes the upper left corner alone
+//! where colour has fewer pixels per angle than depth; we follow the plain path.
+
+use crate::{Error, Image, PixelFormat};
+use kinematics::{Intrinsics, Lens, Transform};
+
+/// Moves depth images of one camera into the pixels of another; what does not change between images is worked out once.
+#[derive(Clone, Debug)]
+pub struct DepthAlignment {
+    depth_px: [u32; 2],
+    color: ColorCamera,
+    /// Rays of the pixels' corners, `z` = 1 in the depth camera, in the axes of the colour camera: `[height + 1, width + 1]`.
+    corners: [Vec<f32>; 3],
+    /// The depth camera in the frame of the colour camera, metres.
+    depth_in_color: [f64; 3],
+}
+
+/// [`Intrinsics`] in f32.
+#[derive(Clone, Debug)]
+struct ColorCamera {
+    size_px: [u32; 2],
+    focal_px: [f32; 2],
+    principal_px: [f32; 2],
+    lens: ColorLens,
+    /// Square of the radius on the plane `z` = 1 up to which the lens is in use; beyond it distortion polynomials may turn back.
+    reach2: f32,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum ColorLens {
+    Pinhole,
+    BrownConrady([f32; 5]),
+    KannalaBrandt([f32; 4]),
+}
+
+/// First and last column and row that each pixel of one row of depth covers, cut to the image; counted from 1, so that 0 is
+/// before the image. Where a first one is behind a last one nothing is covered.
+struct Covered {
+    first: [Vec<u16>; 2],
+    last: [Vec<u16>; 2],
+}
+
+/// Which corner of each pixel of one row of depth.
+#[derive(Clone, Copy)]
+enum Corner {
+    /// Left and upper: what is not seen lies behind the image.
+    First,
+    /// Right and lower: what is not seen lies before the image.
+    Last,
+}
+
+/// From a ray to a position in the colour image.
+struct View {
+    /// The depth camera in the frame of the colour camera, in units of one count.
+    depth_in_color: [f32; 3],
+    focal_px: [f32; 2],
+    principal_px: [f32; 2],
+    /// Position that stands for what the colour camera does not see.
+    unseen_px: f32,
+}
+
+/// Room for the work on one row of depth.
+struct Row {
+    /// Depth along z, in units of one count.
+    counts: Vec<f32>,
+    /// Columns and rows in the colour image, pixels.
+    positions_px: [Vec<f32>; 2],
+    covered: Covered,
+}
+
+impl DepthAlignment {
+    /// For the images of a depth camera seen beside a colour camera; both lenses may be distorted.
+    pub fn new(depth: &Intrinsics, color: &Intrinsics, color_from_depth: &Transform) -> Self {
+        let [width, height] = depth.size_px;
+        let rays = (0..=height).flat_map(|row| (0..=width).map(move |column| [f64::from(column), f64::from(row)]));
+        let rays: Vec<[f64; 3]> = rays
+            .map(|corner| match depth.unproject(corner) {
+                Some(ray) => (color_from_depth.rotation * ray).into(),
+                None => [f64::NAN; 3],
+            })
+            .collect();
+        Self {
+            depth_px: depth.size_px,
+            color: ColorCamera::new(color),
+            corners: std::array::from_fn(|axis| rays.iter().map(|ray| narrow(ray[axis])).collect()),
+            depth_in_color: color_from_depth.translation.vector.into(),
+        }
+    }
+
+    /// The depth image in the pixels of the colour image: the same counts, along the z axis of the depth camera; 0 where no
+    /// depth pixel is seen. Readings of 0 and of the largest count say nothing and go nowhere.
+    ///
+    /// Fails for images that hold no depth or have another size than the depth camera.
+    pub fn align(&self, depth: &Image) -> Result<Image, Error> {
+        let PixelFormat::DepthU16 { metres_per_count } = depth.format else {
+            return Err(depth.wrong_kind("depth"));
+        };
+        if depth.size_px != self.depth_px {
+            return Err(Error::ImageSize {
+                camera: depth.camera.to_string(),
+                stamp: depth.stamp,
+                got_px: depth.size_px,
+                expected_px: self.depth_px,
+            });
+        }
+        let counts: Vec<u16> =
+            depth.raw_bytes()?.as_chunks::<2>().0.iter().map(|&bytes| u16::from_le_bytes(bytes)).collect();
+        let aligned = self.align_counts(&counts, metres_per_count);
+        let mut data = vec![0; 2 * aligned.len()];
+        for (bytes, less_one) in data.as_chunks_mut::<2>().0.iter_mut().zip(aligned) {
+            let count = less_one.wrapping_add(1);
+            // The largest count says nothing either.
+            *bytes = if count == u16::MAX { [0; 2] } else { count.to_le_bytes() };
+        }
+        Ok(Image { size_px: self.color.size_px, data: data.into(), ..depth.clone() })
+    }
+
+    /// The nearest count less one of each colour pixel: so 0, which says nothing, is the largest number and never stays.
+    fn align_counts(&self, counts: &[u16], metres_per_count: f64) -> Vec<u16> {
+        let [width, height] = self.color.size_px.map(|side| side as usize);
+        let mut aligned = vec![u16::MAX; width * height];
+        let depth_width = self.depth_px[0] as usize;
+        let cells = || [vec![0; depth_width], vec![0; depth_width]];
+        let mut work = Row {
+            counts: vec![0.0; depth_width],
+            positions_px: [vec![0.0; depth_width], vec![0.0; depth_width]],
+            covered: Covered { first: cells(), last: cells() },
+        };
+        // In units of one count, so that counts need no factor.
+        let depth_in_color = self.depth_in_color.map(|metres| narrow(metres / metres_per_count));
+        for (row_ix, row) in counts.chunks_exact(depth_width.max(1)).enumerate() {
+            for (number, count) in work.counts.iter_mut().zip(row) {
+                *number = f32::from(*count);
+            }
+            let first_corner = row_ix * (depth_width + 1);
+            self.project(&mut work, depth_in_color, first_corner, Corner::First);
+            // The opposite corners lie one row and one column on.
+            self.project(&mut work, depth_in_color, first_corner + depth_width + 2, Corner::Last);
+            cover(&mut aligned, width, row, &work.covered);
+        }
+        aligned
+    }
+
+    /// Colour pixels, column and row, where the corners of a row are seen; `start` is the place of the first among all.
+    fn project(&self, work: &mut Row, depth_in_color: [f32; 3], start: usize, corner: Corner) {
+        let view = View {
+            depth_in_color,
+            focal_px: self.color.focal_px,
+            principal_px: self.color.principal_px,
+            unseen_px: match corner {
+                Corner::First => f32::MAX,
+                Corner::Last => -1.0,
+            },
+        };
+        let reach2 = self.color.reach2;
+        let [columns, rows] = &mut work.positions_px;
+        let counts = &work.counts;
+        let rays = [0, 1, 2].map(|axis| &self.corners[axis][start..]);
+        match self.color.lens {
+            ColorLens::Pinhole => project_by(columns, rows, counts, rays, &view, |x, y| ([x, y], true)),
+            ColorLens::BrownConrady(k) => project_by(columns, rows, counts, rays, &view, |x, y| {
+                let r2 = x * x + y * y;
+                (brown_conrady(k, x, y, r2), r2 <= reach2)
+            }),
+            ColorLens::KannalaBrandt(k) => project_by(columns, rows, counts, rays, &view, |x, y| {
+                let r2 = x * x + y * y;
+                (kannala_brandt(k, x, y, r2), r2 <= reach2)
+            }),
+        }
+        let cells = match corner {
+            Corner::First => &mut work.covered.first,
+            Corner::Last => &mut work.covered.last,
+        };
+        for ((cells, positions_px), side) in cells.iter_mut().zip(&work.positions_px).zip(self.color.size_px) {
+            number(cells, positions_px, side, corner);
+        }
+    }
+}
+
+/// Positions in the colour image, columns and rows, by a lens that says where a point of the plane `z` = 1 lies and whether it is
+/// in use there; free of branches, and each list an argument of its own, so that the compiler makes vector code of it.
+#[inline(always)]
+fn project_by(
+    columns: &mut [f32],
+    rows: &mut [f32],
+    counts: &[f32],
+    [xs, ys, zs]: [&[f32]; 3],
+    view: &View,
+    distort: impl Fn(f32, f32) -> ([f32; 2], bool),
+) {
+    let n = counts.len();
+    let (xs, ys, zs, columns, rows) = (&xs[..n], &ys[..n], &zs[..n], &mut columns[..n], &mut rows[..n]);
+    let View { depth_in_color: [tx, ty, tz], focal_px: [fx, fy], principal_px: [cx, cy], unseen_px } = *view;
+    for ix in 0..n {
+        let z = counts[ix] * zs[ix] + tz;
+        let inverse = 1.0 / z;
+        let (x, y) = ((counts[ix] * xs[ix] + tx) * inverse, (counts[ix] * ys[ix] + ty) * inverse);
+        let ([distorted_x, distorted_y], is_in_use) = distort(x, y);
+        // The column alone keeps a pixel away.
+        columns[ix] = if (z > 0.0) & is_in_use { distorted_x * fx + cx } else { unseen_px };
+        rows[ix] = distorted_y * fy + cy;
+    }
+}
+
+/// Numbers of the pixels at some positions, from 1 on, cut to the image and one number behind it ([`Corner::First`]) or before it.
+#[expect(clippy::cast_possible_truncation, reason = "the low 16 bits are the number")]
+fn number(numbers: &mut [u16], positions_px: &[f32], side: u32, corner: Corner) {
+    // Numbers have 16 bits: larger images get no depth beyond.
+    let side = side.min(u32::from(u16::MAX) - 1) as f32;
+    let (least, most) = match corner {
+        Corner::First => (1.0, side + 1.0),
+        Corner::Last => (0.0, side),
+    };
+    // From here on floats have no fractions, and their low bits count.
+    const WHOLE: f32 = 8_388_608.0;
+    for (number, position_px) in numbers.iter_mut().zip(positions_px) {
+        // Comparisons as vector instructions make them, which `max` and `min` are not for what is no number.
+        let from_one = position_px + 1.0;
+        let from_one = if from_one > least { from_one } else { least };
+        let from_one = if from_one < most { from_one } else { most };
+        let nearest = (from_one + WHOLE) - WHOLE;
+        let below = nearest - if nearest > from_one { 1.0 } else { 0.0 };
+        *number = (below + WHOLE).to_bits() as u16;
+    }
+}
+
+/// Puts the counts of one row of depth, less one, where they are nearer than what is there.
+fn cover(aligned: &mut [u16], width: usize, row: &[u16], covered: &Covered) {
+    let Covered { first: [left, top], last: [right, bottom] } = covered;
+    let corners = left.iter().zip(top).zip(right.iter().zip(bottom));
+    for (&count, ((&left, &top), (&right, &bottom))) in row.iter().zip(corners) {
+        if left > right || top > bottom {
+            continue;
+        }
+        let less_one = count.wrapping_sub(1);
+        // First ones are 1 at least.
+        let [left, right, top, bottom] = [left, right, top, bottom].map(|number| usize::from(number) - 1);
+        for line in top..=bottom {
+            let line = &mut aligned[line * width..][..width];
+            if right - left < 3 {
+                // Most squares are this small. All three are written, the same or not: a wrong guess of how many there are
+                // costs more.
+                let columns = [left, (left + 1).min(right), right];
+                let nearest = columns.map(|column| line[column].min(less_one));
+                columns.into_iter().zip(nearest).for_each(|(column, nearest)| line[column] = nearest);
+            } else {
+                line[left..=right].iter_mut().for_each(|nearest| *nearest = less_one.min(*nearest));
+            }
+        }
+    }
+}
+
+impl ColorCamera {
+    fn new(camera: &Intrinsics) -> Self {
+        let lens = match camera.lens {
+            _ if camera.is_pinhole() => ColorLens::Pinhole,
+            Lens::Pinhole => ColorLens::Pinhole,
+            Lens::BrownConrady(k) => ColorLens::BrownConrady(k.map(narrow)),
+            Lens::KannalaBrandt(k) => ColorLens::KannalaBrandt(k.map(narrow)),
+        };
+        let reach = if matches!(lens, ColorLens::Pinhole) { f64::INFINITY } else { reach(camera) };
+        Self {
+            size_px: camera.size_px,
+            focal_px: camera.focal_px.map(narrow),
+            principal_px: camera.principal_px.map(narrow),
+            lens,
+            reach2: narrow(reach * reach),
+        }
+    }
+}
+
+/// The largest radius on the plane `z` = 1 that the edge of an image shows, and a little more for corners just outside.
+fn reach(camera: &Intrinsics) -> f64 {
+    const MARGIN: f64 = 1.02;
+    let [width, height] = camera.size_px;
+    let columns = (0..=width).flat_map(|column| [[column, 0], [column, height]]);
+    let rows = (0..=height).flat_map(|row| [[0, row], [width, row]]);
+    let radii = columns.chain(rows).filter_map(|pixel| Some(camera.unproject(pixel.map(f64::from))?.xy().norm()));
+    let largest = radii.fold(0.0, f64::max);
+    largest * MARGIN
+}
+
+/// As in [`kinematics::Lens`].
+#[inline(always)]
+fn brown_conrady([k1, k2, p1, p2, k3]: [f32; 5], x: f32, y: f32, r2: f32) -> [f32; 2] {
+    let radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
+    let xy2 = 2.0 * x * y;
+    [x * radial + p1 * xy2 + p2 * (r2 + 2.0 * x * x), y * radial + p1 * (r2 + 2.0 * y * y) + p2 * xy2]
+}
+
+/// As in [`kinematics::Lens`].
+#[inline(always)]
+fn kannala_brandt([k1, k2, k3, k4]: [f32; 4], x: f32, y: f32, r2: f32) -> [f32; 2] {
+    let radius = r2.sqrt();
+    let angle = radius.atan();
+    let a2 = angle * angle;
+    let distorted = angle * (1.0 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))));
+    let scale = if radius > 0.0 { distorted / radius } else { 1.0 };
+    [x * scale, y * scale]
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "f32 places a point to 1e-4 pixels")]
+fn narrow(number: f64) -> f32 {
+    number as f32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use kinematics::Stamp;
+    use nalgebra::{Translation3, UnitQuaternion};
+
+    const METRES_PER_COUNT: f64 = 1e-3;
+
+    fn camera([width, height]: [u32; 2], focal_px: f64, lens: Lens) -> Intrinsics {
+        Intrinsics {
+            size_px: [width, height],
+            focal_px: [focal_px, focal_px * 1.003],
+            principal_px: [f64::from(width) * 0.503, f64::from(height) * 0.494],
+            lens,
+            rectified: false,
+        }
+    }
+
+    fn image(size_px: [u32; 2], counts: &[u16]) -> Image {
+        Image {
+            camera: "wrist".into(),
+            stamp: Stamp(7),
+            size_px,
+            format: PixelFormat::DepthU16 { metres_per_count: METRES_PER_COUNT },
+            data: counts.iter().flat_map(|count| count.to_le_bytes()).collect(),
+            exposure_secs: None,
+            n_skipped: 0,
+        }
+    }
+
+    fn counts(image: &Image) -> Vec<u16> {
+        image.data.as_chunks::<2>().0.iter().map(|&bytes| u16::from_le_bytes(bytes)).collect()
+    }
+
+    /// A slanted wall with a box before it, and holes.
+    fn scene([width, height]: [u32; 2]) -> Vec<u16> {
+        let count = |column: u32, row: u32| match (column * 7 + row * 13) % 41 {
+            0 => 0,
+            _ if column > width / 3 && column < width / 2 && row > height / 4 => 600 + (column % 50),
+            _ => 900 + 400 * column / width + 300 * row / height,
+        };
+        let pixels = (0..height).flat_map(|row| (0..width).map(move |column| (column, row)));
+        pixels.map(|(column, row)| u16::try_from(count(column, row)).expect("below two metres")).collect()
+    }
+
+    /// The twin: the same squares in f64 with the lenses of `kinematics`.
+    fn twin(depth: &Intrinsics, color: &Intrinsics, color_from_depth: &Transform, counts: &[u16]) -> Vec<u16> {
+        let [width, height] = color.size_px.map(i64::from);
+        let mut aligned = vec![0; color.size_px.map(|side| side as usize).iter().product()];
+        for (ix, &count) in counts.iter().enumerate().filter(|(_, count)| **count > 0 && **count < u16::MAX) {
+            let column = (ix % depth.size_px[0] as usize) as f64;
+            let row = (ix / depth.size_px[0] as usize) as f64;
+            let seen = |corner: [f64; 2]| {
+                let point = depth.unproject(corner)? * (f64::from(count) * METRES_PER_COUNT);
+                let pixel =
+                    color.project(&(color_from_depth.rotation * point + color_from_depth.translation.vector))?;
+                #[expect(clippy::cast_possible_truncation, reason = "the cast saturates, which is meant")]
+                let cell = |position: f64| position.floor() as i64;
+                Some(pixel.map(cell))
+            };
+            let (Some([left, top]), Some([right, bottom])) = (seen([column, row]), seen([column + 1.0, row + 1.0]))
+            else {
+                continue;
+            };
+            for y in top.max(0)..=bottom.min(height - 1) {
+                for x in left.max(0)..=right.min(width - 1) {
+                    let nearest: &mut u16 = &mut aligned[usize::try_from(y * width + x).expect("inside the image")];
+                    *nearest = if *nearest == 0 { count } else { count.min(*nearest) };
+                }
+            }
+        }
+        aligned
+    }
+
+    /// As on a D435: the colour camera 15 mm beside the depth camera, and turned a little.
+    fn beside() -> Transform {
+        Transform::from_parts(
+            Translation3::new(0.0148, 0.0002, 0.0003),
+            UnitQuaternion::from_euler_angles(0.003, -0.006, 0.002),
+        )
+    }
+
+    fn equal_frac(a: &[u16], b: &[u16]) -> f64 {
+        assert_eq!(a.len(), b.len());
+        a.iter().zip(b).filter(|(a, b)| a == b).count() as f64 / a.len() as f64
+    }
+
+    #[test]
+    fn pixels_are_those_of_the_twin() {
+        // f32 puts a corner on the other side of a pixel's edge once in some ten thousand.
+        const EQUAL_FRAC: f64 = 0.999;
+        let size_px = [320, 240];
+        let scene = scene(size_px);
+        let fisheye = Lens::KannalaBrandt([-0.01, 0.02, -0.015, 0.003]);
+        let d455 = Lens::BrownConrady([-0.0555, 0.0657, -0.0006, 0.0004, -0.0213]);
+        for (depth_lens, color_lens) in [(Lens::Pinhole, Lens::Pinhole), (Lens::Pinhole, d455), (d455, fisheye)] {
+            for (color_px, focal_px) in [([320, 240], 300.0), ([640, 360], 455.0), ([160, 120], 140.0)] {
+                let (depth, color) = (camera(size_px, 190.0, depth_lens), camera(color_px, focal_px, color_lens));
+                let alignment = DepthAlignment::new(&depth, &color, &beside());
+                let got = counts(&alignment.align(&image(size_px, &scene)).expect("depth"));
+                let wanted = twin(&depth, &color, &beside(), &scene);
+                let equal = equal_frac(&got, &wanted);
+                assert!(equal >= EQUAL_FRAC, "{color_lens:?} {color_px:?}: {equal}");
+                assert!(wanted.iter().filter(|count| **count > 0).count() > wanted.len() / 2, "the scene is not seen");
+                // The comparison sees a camera one centimetre elsewhere.
+                let elsewhere = Transform::from_parts(Translation3::new(0.025, 0.0, 0.0), beside().rotation);
+                assert!(equal_frac(&got, &twin(&depth, &color, &elsewhere, &scene)) < EQUAL_FRAC);
+            }
+        }
+    }
+
+    #[test]
+    fn a_wall_moves_by_baseline_over_depth_and_a_box_hides_it() {
+        // 400 px * 51.25 mm / 1 m is 20.5 px to the right; no corner lies on an edge of a pixel's column.
+        let camera =
+            Intrinsics { focal_px: [400.0; 2], principal_px: [32.0, 16.25], ..camera([64, 32], 1.0, Lens::Pinhole) };
+        let color = Intrinsics { principal_px: [32.0, 16.75], ..camera.clone() };
+        let moved = Transform::translation(0.05125, 0.0, 0.0);
+        let alignment = DepthAlignment::new(&camera, &color, &moved);
+        let wall = alignment.align(&image([64, 32], &[1000; 64 * 32])).expect("depth");
+        for (ix, count) in counts(&wall).into_iter().enumerate() {
+            assert_eq!(count, if ix % 64 < 20 { 0 } else { 1000 }, "column {} row {}", ix % 64, ix / 64);
+        }
+        // At 0.5 m it moves by 41 px: columns 10 to 13 go to 51 to 54, and touch 55 at most.
+        let mut with_box = [1000; 64 * 32];
+        (0..64 * 32).filter(|ix| (10..14).contains(&(ix % 64))).for_each(|ix| with_box[ix] = 500);
+        let aligned = counts(&alignment.align(&image([64, 32], &with_box)).expect("depth"));
+        for row in aligned.chunks(64) {
+            assert!(row[51..54].iter().all(|count| *count == 500), "{row:?}");
+            assert!(row[56..].iter().chain(&row[20..30]).all(|count| *count == 1000), "{row:?}");
+        }
+    }
+
+    #[test]
+    fn what_says_nothing_goes_nowhere_and_what_is_not_before_the_camera_is_not_seen() {
+        let camera = camera([64, 48], 60.0, Lens::BrownConrady([0.1, 0.0, 0.0, 0.0, 0.0]));
+        // The colour camera stands 1 mm before the depth camera: a count of 1 lies in its centre.
+        for z in [-0.001, -0.000_999_99, -1.0, f64::NAN] {
+            let alignment = DepthAlignment::new(&camera, &camera, &Transform::translation(0.0, 0.0, z));
+            for count in [0, 1, 2, u16::MAX] {
+                let aligned = alignment.align(&image([64, 48], &[count; 64 * 48])).expect("depth");
+                let seen = counts(&aligned);
+                assert!(seen.iter().all(|seen| *seen == 0 || *seen == count));
+                assert!(![0, u16::MAX].contains(&count) || seen.iter().all(|seen| *seen == 0));
+            }
+        }
+        let alignment = DepthAlignment::new(&camera, &camera, &Transform::identity());
+        assert!(matches!(alignment.align(&image([64, 47], &[0; 64 * 47])), Err(Error::ImageSize { .. })));
+        assert!(matches!(alignment.align(&image([64, 48], &[0; 64 * 47])), Err(Error::ImageLength { .. })));
+        let color = Image { format: PixelFormat::Gray8, ..image([64, 48], &[0; 32 * 48]) };
+        assert!(matches!(alignment.align(&color), Err(Error::WrongKind { wanted: "depth", .. })));
+    }
+
+    #[test]
+    #[ignore = "a measurement: prints milliseconds"]
+    fn speed_at_640x480() {
+        let size_px = [640, 480];
+        let d455 = Lens::BrownConrady([-0.0555, 0.0657, -0.0006, 0.0004, -0.0213]);
+        for (lens, color_px, focal_px) in
+            [(Lens::Pinhole, [640, 480], 610.0), (d455, [640, 480], 610.0), (d455, [1280, 720], 910.0)]
+        {
+            let (depth, color) = (camera(size_px, 385.0, Lens::Pinhole), camera(color_px, focal_px, lens));
+            let alignment = DepthAlignment::new(&depth, &color, &beside());
+            let depth = image(size_px, &scene(size_px));
+            let best = (0..50).map(|_| {
+                let began = std::time::Instant::now();
+                std::hint::black_box(alignment.align(std::hint::black_box(&depth)).expect("depth"));
+                began.elapsed()
+            });
+            eprintln!("640x480 to {color_px:?}, {lens:?}: {:.2?} at best", best.min().expect("50 runs"));
+        }
+    }
+}

@@ -1,0 +1,204 @@
+//! One CAN bus: frames out, frames and errors in, each stamped as the kernel got it.
+
+use super::config::BusConfig;
+use super::link::Link;
+use crate::wire::can::frame::Stuffing;
+use crate::wire::can::{Frame, Id};
+use crate::{Error, clock};
+use kinematics::Stamp;
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::io::Errno;
+use socketcan::{
+    CanAnyFrame, CanDataFrame, CanErrorFrame, CanFdFrame, CanFdSocket, CanRemoteFrame, EmbeddedFrame, ExtendedId,
+    Id as SocketId, ShouldRetry, Socket, SocketOptions, StandardId, errors::ControllerProblems,
+};
+use std::io;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+/// A frame that found no room in the interface's queue is tried again for so long.
+const MAX_SENDING: Duration = Duration::from_millis(20);
+/// The system's number for "no buffer space": the interface's queue is full.
+const ENOBUFS: i32 = 105;
+
+/// What came.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Arrived {
+    /// A frame of somebody else.
+    Frame(Frame),
+    /// The controller tells of errors on the wire.
+    Errors(WireErrors),
+}
+
+/// What error frames told, counted; one frame may tell several.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct WireErrors {
+    /// Error frames.
+    pub n_frames: u64,
+    /// The controller went off the bus.
+    pub n_bus_off: u64,
+    /// It came back.
+    pub n_restarts: u64,
+    /// It passed the mark of 128 errors.
+    pub n_passive: u64,
+    /// Nobody acknowledged a frame: there is no one else, or no one at this bit rate.
+    pub n_unacknowledged: u64,
+    /// Frames that the controller or the kernel had no room for.
+    pub n_overflows: u64,
+}
+
+impl WireErrors {
+    fn of(frame: CanErrorFrame) -> Self {
+        let error = frame.into_error();
+        let problems = error.controller();
+        let has = |problem| problems.is_some_and(|problems| problems.contains(problem));
+        Self {
+            n_frames: 1,
+            n_bus_off: error.is_bus_off().into(),
+            n_restarts: error.is_restarted().into(),
+            n_passive: (has(ControllerProblems::RX_PASSIVE) || has(ControllerProblems::TX_PASSIVE)).into(),
+            n_unacknowledged: error.is_no_ack().into(),
+            n_overflows: (has(ControllerProblems::RX_OVERFLOW) || has(ControllerProblems::TX_OVERFLOW)).into(),
+        }
+    }
+
+    /// Adds what another one counted.
+    pub fn add(&mut self, more: &Self) {
+        self.n_frames += more.n_frames;
+        self.n_bus_off += more.n_bus_off;
+        self.n_restarts += more.n_restarts;
+        self.n_passive += more.n_passive;
+        self.n_unacknowledged += more.n_unacknowledged;
+        self.n_overflows += more.n_overflows;
+    }
+}
+
+/// An open bus. Dropping it closes the socket; the interface stays as it is.
+#[derive(Debug)]
+pub struct Bus {
+    config: BusConfig,
+    socket: CanFdSocket,
+    /// How long frames kept the bus busy, those of others and our own, nanoseconds.
+    busy_nanos: AtomicU64,
+}
+
+impl Bus {
+    /// Opens an interface that is set up as `config` wants it; where it is not, the error names the command that mends it.
+    pub fn open(config: &BusConfig) -> Result<Self, Error> {
+        Link::read(&config.interface)?.check(config)?;
+        let open = CanFdSocket::open(&config.interface).and_then(|socket| {
+            socket.set_error_filter_accept_all()?;
+            socket.set_recv_timestamp(true)?;
+            socket.set_nonblocking(true)?;
+            Ok(socket)
+        });
+        let socket = open.map_err(|source| Error::CanBus { interface: config.interface.clone(), source })?;
+        Ok(Self { config: config.clone(), socket, busy_nanos: AtomicU64::new(0) })
+    }
+
+    /// How it was opened.
+    pub fn config(&self) -> &BusConfig {
+        &self.config
+    }
+
+    /// How long frames have kept the bus busy since it was opened, errors and stuff bits left out.
+    pub fn busy(&self) -> Duration {
+        Duration::from_nanos(self.busy_nanos.load(Ordering::Relaxed))
+    }
+
+    /// Sends a frame; waits a moment where the interface's queue is full. False where it stayed full, as it does while the
+    /// controller is off the bus or nobody acknowledges.
+    pub fn send(&self, frame: &Frame) -> Result<bool, Error> {
+        let began = clock::now();
+        loop {
+            match self.write(frame) {
+                Ok(()) => {
+                    self.count(frame);
+                    return Ok(true);
+                }
+                Err(error) if error.raw_os_error() == Some(ENOBUFS) || error.should_retry() => {
+                    if clock::now().duration_since(began) >= MAX_SENDING {
+                        return Ok(false);
+                    }
+                    std::thread::sleep(Duration::from_micros(200));
+                }
+                Err(source) => return Err(self.refused(source)),
+            }
+        }
+    }
+
+    fn write(&self, frame: &Frame) -> io::Result<()> {
+        let id = socket_id(frame.id());
+        let unfit = || io::Error::from(io::ErrorKind::InvalidInput);
+        if frame.is_remote() {
+            let made = CanRemoteFrame::new_remote(id, frame.n_bytes()).ok_or_else(unfit)?;
+            return self.socket.write_frame(&made);
+        }
+        if frame.is_fd() {
+            let mut made = CanFdFrame::new(id, frame.data()).ok_or_else(unfit)?;
+            made.set_brs(frame.is_switched());
+            return self.socket.write_frame(&made);
+        }
+        self.socket.write_frame(&CanDataFrame::new(id, frame.data()).ok_or_else(unfit)?)
+    }
+
+    /// Waits for what comes next; `None` where nothing came.
+    pub fn receive(&self, timeout: Duration) -> Result<Option<(Stamp, Arrived)>, Error> {
+        // A receive timeout of the socket counts in jiffies, up to 10 ms each; that of ppoll is fine.
+        let timeout = Timespec { tv_sec: saturated(timeout.as_secs()), tv_nsec: timeout.subsec_nanos().into() };
+        match poll(&mut [PollFd::new(&self.socket, PollFlags::IN)], Some(&timeout)) {
+            Ok(0) | Err(Errno::INTR) => return Ok(None),
+            Ok(_) => {}
+            Err(error) => return Err(self.refused(error.into())),
+        }
+        let (frame, at) = match self.socket.read_frame_with_timestamp() {
+            Ok(read) => read,
+            Err(error) if error.should_retry() => return Ok(None),
+            Err(source) => return Err(self.refused(source)),
+        };
+        let now = clock::now();
+        // The kernel's stamp is of the wall clock; how long ago it was is the same on ours.
+        let stamp = at.elapsed().map_or(now, |age| now - age);
+        let frame = match frame {
+            CanAnyFrame::Error(error) => return Ok(Some((stamp, Arrived::Errors(WireErrors::of(error))))),
+            CanAnyFrame::Normal(frame) => Frame::classic(own_id(&frame), frame.data()),
+            CanAnyFrame::Remote(frame) => Frame::remote(own_id(&frame), frame.dlc()),
+            CanAnyFrame::Fd(frame) => Frame::fd(own_id(&frame), frame.data(), frame.is_brs()),
+        };
+        let frame = frame.map_err(|error| self.refused(io::Error::other(error.to_string())))?;
+        self.count(&frame);
+        Ok(Some((stamp, Arrived::Frame(frame))))
+    }
+
+    fn count(&self, frame: &Frame) {
+        let busy = Duration::from_secs_f64(frame.bits(Stuffing::None).seconds(self.config.rates()));
+        let nanos = u64::try_from(busy.as_nanos()).unwrap_or(u64::MAX);
+        self.busy_nanos.fetch_add(nanos, Ordering::Relaxed);
+    }
+
+    fn refused(&self, source: io::Error) -> Error {
+        Error::CanBus { interface: self.config.interface.clone(), source }
+    }
+}
+
+fn saturated(seconds: u64) -> i64 {
+    i64::try_from(seconds).unwrap_or(i64::MAX)
+}
+
+fn socket_id(id: Id) -> SocketId {
+    match id.is_extended() {
+        true => SocketId::Extended(ExtendedId::new(id.value()).expect("29 bits by its making")),
+        false => {
+            let value = u16::try_from(id.value()).expect("11 bits by its making");
+            SocketId::Standard(StandardId::new(value).expect("11 bits by its making"))
+        }
+    }
+}
+
+fn own_id(frame: &impl EmbeddedFrame) -> Id {
+    match frame.id() {
+        SocketId::Standard(id) => Id::standard(id.as_raw().into()),
+        SocketId::Extended(id) => Id::extended(id.as_raw()),
+    }
+    .expect("identifiers have 11 or 29 bits")
+}

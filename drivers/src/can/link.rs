@@ -1,0 +1,271 @@
+//! How a CAN interface is set up, what is wrong with that, and the command that mends it.
+
+use super::config::BusConfig;
+use crate::Error;
+use socketcan::CanInterface;
+use socketcan::nl::{CanState, InterfaceDetails, Mtu};
+use std::io;
+
+/// How long a controller that went off the bus waits before it tries again, as we have it set up, milliseconds.
+const RESTART_MILLIS: u32 = 100;
+
+/// What the error counters of a controller have come to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum State {
+    /// All is well.
+    Active,
+    /// 96 errors and more.
+    Warning,
+    /// 128 and more: it no longer disturbs others' frames.
+    Passive,
+    /// 256 and more: it takes no part any more until it is restarted.
+    BusOff,
+    /// Down or asleep.
+    Stopped,
+}
+
+/// How an interface is set up, as the kernel tells.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Link {
+    /// Name.
+    pub interface: String,
+    /// Whether it is up.
+    pub is_up: bool,
+    /// Whether it takes FD frames.
+    pub is_fd: bool,
+    /// Bits a second; `None` where it has none, as virtual ones have not, or none was set.
+    pub bitrate_hz: Option<u32>,
+    /// Bits a second of the data of FD frames.
+    pub data_bitrate_hz: Option<u32>,
+    /// After how long it comes back by itself when it went off the bus; 0 is never.
+    pub restart_millis: Option<u32>,
+    /// What its error counters have come to; `None` where it has none.
+    pub state: Option<State>,
+    /// Errors counted while sending and while receiving, now.
+    pub n_errors: Option<[u16; 2]>,
+}
+
+/// What is wrong with an interface.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Complaint {
+    /// In words.
+    pub what: String,
+    /// What a person types to mend it.
+    pub command: String,
+}
+
+impl Link {
+    /// Asks the kernel. An interface that does not exist is an error that says how the others are called.
+    pub fn read(interface: &str) -> Result<Self, Error> {
+        let details = CanInterface::open(interface).and_then(|open| open.details());
+        details.map(|details| Self::of(interface, &details)).map_err(|error| {
+            let source = match told(error) {
+                source if source.raw_os_error() == Some(ENODEV) => missing(),
+                source => source,
+            };
+            Error::CanBus { interface: interface.to_owned(), source }
+        })
+    }
+
+    fn of(interface: &str, details: &InterfaceDetails) -> Self {
+        let can = &details.can;
+        let rate = |timing: Option<socketcan::nl::CanBitTiming>| {
+            timing.map(|timing| timing.bitrate).filter(|bitrate_hz| *bitrate_hz > 0)
+        };
+        Self {
+            interface: interface.to_owned(),
+            is_up: details.is_up,
+            is_fd: details.mtu == Some(Mtu::Fd),
+            bitrate_hz: rate(can.bit_timing),
+            data_bitrate_hz: rate(can.data_bit_timing),
+            restart_millis: can.restart_ms,
+            state: can.state.map(|state| match state {
+                CanState::ErrorActive => State::Active,
+                CanState::ErrorWarning => State::Warning,
+                CanState::ErrorPassive => State::Passive,
+                CanState::BusOff => State::BusOff,
+                CanState::Stopped | CanState::Sleeping => State::Stopped,
+            }),
+            n_errors: can.berr_counter.map(|counter| [counter.txerr, counter.rxerr]),
+        }
+    }
+
+    /// Whether it is a virtual interface: it has no bits, so no rate and no errors.
+    fn is_virtual(&self) -> bool {
+        self.state.is_none()
+    }
+
+    /// What must be mended before motors on it can be read as `wanted`; nothing where all is well.
+    pub fn complaints(&self, wanted: &BusConfig) -> Vec<Complaint> {
+        let command = set_up(&self.interface, self.is_virtual(), wanted);
+        let mut complaints = Vec::new();
+        let mut complain = |what: String| complaints.push(Complaint { what, command: command.clone() });
+        if !self.is_up {
+            complain("it is down".to_owned());
+        }
+        if wanted.data_bitrate_hz.is_some() && !self.is_fd {
+            complain("it does not take FD frames".to_owned());
+        }
+        if self.is_virtual() {
+            return complaints;
+        }
+        match self.bitrate_hz {
+            Some(bitrate_hz) if bitrate_hz == wanted.bitrate_hz => {}
+            Some(bitrate_hz) => {
+                complain(format!("its bit rate is {bitrate_hz}, the rig file says {}", wanted.bitrate_hz));
+            }
+            None => complain(format!("no bit rate is set, the rig file says {}", wanted.bitrate_hz)),
+        }
+        if let Some(data_bitrate_hz) = wanted.data_bitrate_hz.filter(|rate| self.data_bitrate_hz != Some(*rate)) {
+            let is = self.data_bitrate_hz.map_or_else(|| "not set".to_owned(), |rate| rate.to_string());
+            complain(format!("its bit rate of FD data is {is}, the rig file says {data_bitrate_hz}"));
+        }
+        if self.restart_millis == Some(0) {
+            complain("it does not come back by itself once it went off the bus (restart-ms 0)".to_owned());
+        }
+        if self.is_up && self.state >= Some(State::BusOff) {
+            complain("it is off the bus: look at wiring, termination and the bit rate of the others".to_owned());
+        }
+        complaints
+    }
+
+    /// The first complaint as an error.
+    pub fn check(&self, wanted: &BusConfig) -> Result<(), Error> {
+        match self.complaints(wanted).into_iter().next() {
+            Some(Complaint { what, command }) => {
+                Err(Error::CanLink { interface: self.interface.clone(), what, command })
+            }
+            None => Ok(()),
+        }
+    }
+}
+
+impl std::fmt::Display for Link {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}: {}", self.interface, if self.is_up { "up" } else { "down" })?;
+        match (self.bitrate_hz, self.data_bitrate_hz) {
+            (Some(rate), Some(data)) => write!(f, ", {rate} and {data} bit/s")?,
+            (Some(rate), None) => write!(f, ", {rate} bit/s")?,
+            (None, _) if self.is_virtual() => write!(f, ", virtual")?,
+            (None, _) => {}
+        }
+        if let Some(state) = self.state {
+            write!(f, ", state {}", format!("{state:?}").to_lowercase())?;
+        }
+        match self.n_errors {
+            Some([sent, received]) => write!(f, ", {sent} errors sending and {received} receiving"),
+            None => Ok(()),
+        }
+    }
+}
+
+/// The line that sets an interface up as wanted.
+fn set_up(interface: &str, is_virtual: bool, wanted: &BusConfig) -> String {
+    if is_virtual {
+        return match wanted.data_bitrate_hz {
+            // Its length of frames cannot be changed while it is up.
+            Some(_) => format!("sudo ip link set {interface} down; sudo ip link set {interface} mtu 72 up"),
+            None => format!("sudo ip link set {interface} up"),
+        };
+    }
+    let fd = wanted.data_bitrate_hz.map_or_else(String::new, |rate| format!(" dbitrate {rate} fd on"));
+    format!(
+        "sudo ip link set {interface} down; sudo ip link set {interface} up type can bitrate {}{fd} restart-ms {RESTART_MILLIS}",
+        wanted.bitrate_hz
+    )
+}
+
+/// The system's number for "no such device".
+const ENODEV: i32 = 19;
+
+/// Names of this machine's CAN interfaces, virtual ones too, in order.
+pub fn interfaces() -> Vec<String> {
+    // ARPHRD_CAN of `linux/if_arp.h`.
+    let is_can = |name: &String| {
+        std::fs::read_to_string(format!("/sys/class/net/{name}/type")).is_ok_and(|kind| kind.trim() == "280")
+    };
+    let all = std::fs::read_dir("/sys/class/net").into_iter().flatten();
+    let mut names: Vec<String> =
+        all.filter_map(|entry| entry.ok()?.file_name().into_string().ok()).filter(is_can).collect();
+    names.sort();
+    names
+}
+
+fn missing() -> io::Error {
+    let others = match interfaces().as_slice() {
+        [] => "this machine has none; is the adapter plugged in, and its driver loaded?".to_owned(),
+        names => format!("there is {}", names.join(", ")),
+    };
+    io::Error::new(io::ErrorKind::NotFound, format!("no such interface: {others}"))
+}
+
+/// What the system said, with its number where there is one.
+fn told(error: socketcan::Error) -> io::Error {
+    match error {
+        socketcan::Error::Io(error) => error,
+        socketcan::Error::Nl(error) => {
+            error.errno().map_or_else(|| io::Error::other(error.to_string()), io::Error::from_raw_os_error)
+        }
+        error => io::Error::other(error.to_string()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn wanted(data_bitrate_hz: Option<u32>) -> BusConfig {
+        BusConfig { interface: "can0".to_owned(), bitrate_hz: 1_000_000, data_bitrate_hz }
+    }
+
+    fn good() -> Link {
+        Link {
+            interface: "can0".to_owned(),
+            is_up: true,
+            is_fd: false,
+            bitrate_hz: Some(1_000_000),
+            data_bitrate_hz: None,
+            restart_millis: Some(100),
+            state: Some(State::Active),
+            n_errors: Some([0, 0]),
+        }
+    }
+
+    #[test]
+    fn what_is_wrong_is_told_with_the_command_that_mends_it() {
+        const MENDS: &str =
+            "sudo ip link set can0 down; sudo ip link set can0 up type can bitrate 1000000 restart-ms 100";
+        assert_eq!(good().complaints(&wanted(None)), []);
+        let bent: [(Link, &str); 5] = [
+            (Link { is_up: false, state: Some(State::Stopped), ..good() }, "it is down"),
+            (Link { bitrate_hz: Some(500_000), ..good() }, "its bit rate is 500000, the rig file says 1000000"),
+            (Link { bitrate_hz: None, ..good() }, "no bit rate is set"),
+            (Link { restart_millis: Some(0), ..good() }, "does not come back by itself"),
+            (Link { state: Some(State::BusOff), ..good() }, "off the bus"),
+        ];
+        for (link, what) in bent {
+            let complaints = link.complaints(&wanted(None));
+            assert_eq!(complaints.len(), 1, "{complaints:?}");
+            assert!(complaints[0].what.contains(what), "{complaints:?}");
+            assert_eq!(complaints[0].command, MENDS);
+            assert!(link.check(&wanted(None)).is_err_and(|error| error.to_string().contains(MENDS)));
+        }
+    }
+
+    #[test]
+    fn frames_with_flexible_data_rate_need_it_switched_on() {
+        let complaints = good().complaints(&wanted(Some(5_000_000)));
+        assert_eq!(complaints.len(), 2, "{complaints:?}");
+        assert!(complaints[0].command.ends_with("bitrate 1000000 dbitrate 5000000 fd on restart-ms 100"));
+        let link = Link { is_fd: true, data_bitrate_hz: Some(5_000_000), ..good() };
+        assert_eq!(link.complaints(&wanted(Some(5_000_000))), []);
+    }
+
+    #[test]
+    fn virtual_interfaces_have_no_rate_and_need_only_be_up() {
+        let link = Link { bitrate_hz: None, restart_millis: None, state: None, n_errors: None, ..good() };
+        assert_eq!(link.complaints(&wanted(None)), []);
+        let down = Link { is_up: false, ..link };
+        assert_eq!(down.complaints(&wanted(None))[0].command, "sudo ip link set can0 up");
+    }
+}

@@ -1,0 +1,231 @@
+//! Whole JPEG files out of what cameras send: without Huffman tables, cut off, doubled, with bytes behind.
+//!
+//! Source: ITU-T T.81, annex B (markers) and annex K.3 (the tables that motion JPEG leaves out).
+
+use std::borrow::Cow;
+
+/// Why a buffer holds no JPEG image.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum NoJpeg {
+    /// No image begins in it.
+    #[error("no JPEG begins in it")]
+    NoStart,
+    /// An image begins, and the buffer or another image comes before its end.
+    #[error("the JPEG is cut off")]
+    CutOff,
+    /// An image begins and ends without a picture.
+    #[error("the JPEG ends before its picture begins")]
+    NoPicture,
+}
+
+const START_OF_IMAGE: u8 = 0xd8;
+const END_OF_IMAGE: u8 = 0xd9;
+const START_OF_SCAN: u8 = 0xda;
+const HUFFMAN_TABLES: u8 = 0xc4;
+/// Baseline and extended sequential frames with Huffman codes: those that the standard tables can decode.
+const SEQUENTIAL_FRAMES: [u8; 2] = [0xc0, 0xc1];
+
+/// The first whole image in a buffer, from its first marker to its last, with the standard Huffman tables where it has none.
+///
+/// What comes before and behind it is left out, as is an image that another one cuts off. A thumbnail inside a segment is
+/// part of the image around it. The picture itself is not decoded here.
+pub fn first_image(buffer: &[u8]) -> Result<Cow<'_, [u8]>, NoJpeg> {
+    let mut reason = NoJpeg::NoStart;
+    let mut start = 0;
+    while let Some(offset) = buffer[start..].windows(2).position(|pair| pair == [0xff, START_OF_IMAGE]) {
+        start += offset;
+        match walk(buffer, start) {
+            Ok(Whole { end, first_scan, needs_tables: true }) => {
+                return Ok([&buffer[start..first_scan], &STANDARD_TABLES, &buffer[first_scan..end]].concat().into());
+            }
+            Ok(Whole { end, .. }) => return Ok(buffer[start..end].into()),
+            Err((why, resume)) => {
+                // The first failure says most: what follows it are often only its remains.
+                if reason == NoJpeg::NoStart {
+                    reason = why;
+                }
+                start = resume;
+            }
+        }
+    }
+    Err(reason)
+}
+
+/// Where an image lies in its buffer.
+struct Whole {
+    /// Just behind its last marker.
+    end: usize,
+    /// The marker of its first scan.
+    first_scan: usize,
+    /// No Huffman table comes before the first scan, and the standard ones fit.
+    needs_tables: bool,
+}
+
+/// Goes from marker to marker of the image that begins at `start`; failing says why and where the next image may begin.
+fn walk(buffer: &[u8], start: usize) -> Result<Whole, (NoJpeg, usize)> {
+    let mut at = start + 2;
+    let mut first_scan = None;
+    let mut has_tables = false;
+    let mut is_sequential = false;
+    loop {
+        // Also steps over coded data, where a 0xff is followed by 0, and over bytes that belong to nothing.
+        let (marker_at, marker) = next_marker(buffer, at).ok_or((NoJpeg::CutOff, buffer.len()))?;
+        at = marker_at + 2;
+        match (marker, first_scan) {
+            (START_OF_IMAGE, _) => return Err((NoJpeg::CutOff, marker_at)),
+            (END_OF_IMAGE, None) => return Err((NoJpeg::NoPicture, at)),
+            (END_OF_IMAGE, Some(first_scan)) => {
+                return Ok(Whole { end: at, first_scan, needs_tables: is_sequential && !has_tables });
+            }
+            (HUFFMAN_TABLES, None) => has_tables = true,
+            (START_OF_SCAN, None) => first_scan = Some(marker_at),
+            (frame, _) if SEQUENTIAL_FRAMES.contains(&frame) => is_sequential = true,
+            _ => {}
+        }
+        // The length counts its own two bytes.
+        let &[high, low, ..] = &buffer[at..] else { return Err((NoJpeg::CutOff, buffer.len())) };
+        at += usize::from(u16::from_be_bytes([high, low])).max(2);
+        if at > buffer.len() {
+            return Err((NoJpeg::CutOff, buffer.len()));
+        }
+    }
+}
+
+/// Place and code of the next marker other than those without meaning here: restarts and the private 0x01.
+fn next_marker(buffer: &[u8], from: usize) -> Option<(usize, u8)> {
+    let means = |code: u8| !matches!(code, 0x00 | 0x01 | 0xd0..=0xd7 | 0xff);
+    let offset = buffer[from..].windows(2).position(|pair| pair[0] == 0xff && means(pair[1]))?;
+    Some((from + offset, buffer[from + offset + 1]))
+}
+
+/// One segment with the tables of K.3: luminance and chrominance, DC and AC.
+static STANDARD_TABLES: [u8; 420] = [
+    0xff, 0xc4, 0x01, 0xa2, // Marker and length.
+    // K.3, DC of luminance.
+    0x00, //
+    0, 1, 5, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0, //
+    0x00, 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x09, 0x0a, 0x0b, //
+    // K.5, AC of luminance.
+    0x10, //
+    0, 2, 1, 3, 3, 2, 4, 3, 5, 5, 4, 4, 0, 0, 1, 125, //
+    0x01, 0x02, 0x03, 0x00, 0x04, 0x11, 0x05, 0x12, 0x21, 0x31, 0x41, 0x06, 0x13, 0x51, 0x61, 0x07, 0x22, 0x71, //
+    0x14, 0x32, 0x81, 0x91, 0xa1, 0x08, 0x23, 0x42, 0xb1, 0xc1, 0x15, 0x52, 0xd1, 0xf0, 0x24, 0x33, 0x62, 0x72, //
+    0x82, 0x09, 0x0a, 0x16, 0x17, 0x18, 0x19, 0x1a, 0x25, 0x26, 0x27, 0x28, 0x29, 0x2a, 0x34, 0x35, 0x36, 0x37, //
+    0x38, 0x39, 0x3a, 0x43, 0x44, 0x45, 0x46, 0x47, 0x48, 0x49, 0x4a, 0x53, 0x54, 0x55, 0x56, 0x57, 0x58, 0x59, //
+    0x5a, 0x63, 0x64, 0x65, 0x66, 0x67, 0x68, 0x69, 0x6a, 0x73, 0x74, 0x75, 0x76, 0x77, 0x78, 0x79, 0x7a, 0x83, //
+    0x84, 0x85, 0x86, 0x87, 0x88, 0x89, 0x8a, 0x92, 0x93, 0x94, 0x95, 0x96, 0x97, 0x98, 0x99, 0x9a, 0xa2, 0xa3, //
+    0xa4, 0xa5, 0xa6, 0xa7, 0xa8, 0xa9, 0xaa, 0xb2, 0xb3, 0xb4, 0xb5, 0xb6, 0xb7, 0xb8, 0xb9, 0xba, 0xc2, 0xc3, //
+    0xc4, 0xc5, 0xc6, 0xc7, 0xc8, 0xc9, 0xca, 0xd2, 0xd3, 0xd4, 0xd5, 0xd6, 0xd7, 0xd8, 0xd9, 0xda, 0xe1, 0xe2, //
+    0xe3, 0xe4, 0xe5, 0xe6, 0xe7, 0xe8, 0xe9, 0xea, 0xf1, 0xf2, 0xf3, 0xf4, 0xf5, 0xf6, 0xf7, 0xf8, 0xf9, 0xfa, //
+    // K.4, DC of chrominance.
+    0x01, //
+    0, 3, 1, 1, 1, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0, 0, //
+    0x00, 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x09, 0x0a, 0x0b, //
+    // K.6, AC of chrominance.
+    0x11, //
+    0, 2, 1, 2, 4, 4, 3, 4, 7, 5, 4, 4, 0, 1, 2, 119, //
+    0x00, 0x01, 0x02, 0x03, 0x11, 0x04, 0x05, 0x21, 0x31, 0x06, 0x12, 0x41, 0x51, 0x07, 0x61, 0x71, 0x13, 0x22, //
+    0x32, 0x81, 0x08, 0x14, 0x42, 0x91, 0xa1, 0xb1, 0xc1, 0x09, 0x23, 0x33, 0x52, 0xf0, 0x15, 0x62, 0x72, 0xd1, //
+    0x0a, 0x16, 0x24, 0x34, 0xe1, 0x25, 0xf1, 0x17, 0x18, 0x19, 0x1a, 0x26, 0x27, 0x28, 0x29, 0x2a, 0x35, 0x36, //
+    0x37, 0x38, 0x39, 0x3a, 0x43, 0x44, 0x45, 0x46, 0x47, 0x48, 0x49, 0x4a, 0x53, 0x54, 0x55, 0x56, 0x57, 0x58, //
+    0x59, 0x5a, 0x63, 0x64, 0x65, 0x66, 0x67, 0x68, 0x69, 0x6a, 0x73, 0x74, 0x75, 0x76, 0x77, 0x78, 0x79, 0x7a, //
+    0x82, 0x83, 0x84, 0x85, 0x86, 0x87, 0x88, 0x89, 0x8a, 0x92, 0x93, 0x94, 0x95, 0x96, 0x97, 0x98, 0x99, 0x9a, //
+    0xa2, 0xa3, 0xa4, 0xa5, 0xa6, 0xa7, 0xa8, 0xa9, 0xaa, 0xb2, 0xb3, 0xb4, 0xb5, 0xb6, 0xb7, 0xb8, 0xb9, 0xba, //
+    0xc2, 0xc3, 0xc4, 0xc5, 0xc6, 0xc7, 0xc8, 0xc9, 0xca, 0xd2, 0xd3, 0xd4, 0xd5, 0xd6, 0xd7, 0xd8, 0xd9, 0xda, //
+    0xe2, 0xe3, 0xe4, 0xe5, 0xe6, 0xe7, 0xe8, 0xe9, 0xea, 0xf2, 0xf3, 0xf4, 0xf5, 0xf6, 0xf7, 0xf8, 0xf9, 0xfa, //
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::{ExtendedColorType, ImageFormat};
+
+    /// A picture of 48x40 pixels with its segments as the encoder of the `image` crate writes them.
+    fn jpeg() -> Vec<u8> {
+        let rgb: Vec<u8> = (0..3 * 48 * 40).map(|ix: u32| (ix * ix % 251) as u8).collect();
+        let mut file = std::io::Cursor::new(Vec::new());
+        image::write_buffer_with_format(&mut file, &rgb, 48, 40, ExtendedColorType::Rgb8, ImageFormat::Jpeg)
+            .expect("a small picture");
+        file.into_inner()
+    }
+
+    /// The file without its segments of one marker.
+    fn without(jpeg: &[u8], unwanted: u8) -> Vec<u8> {
+        let mut kept = jpeg[..2].to_vec();
+        let mut at = 2;
+        while jpeg[at + 1] != START_OF_SCAN {
+            let end = at + 2 + usize::from(u16::from_be_bytes([jpeg[at + 2], jpeg[at + 3]]));
+            if jpeg[at + 1] != unwanted {
+                kept.extend(&jpeg[at..end]);
+            }
+            at = end;
+        }
+        kept.extend(&jpeg[at..]);
+        kept
+    }
+
+    fn pixels(jpeg: &[u8]) -> Vec<u8> {
+        let decoded = image::load_from_memory_with_format(jpeg, ImageFormat::Jpeg);
+        decoded.expect("a whole file").into_rgb8().into_raw()
+    }
+
+    #[test]
+    fn an_image_without_huffman_tables_gets_the_standard_ones() {
+        let whole = jpeg();
+        let bare = without(&whole, HUFFMAN_TABLES);
+        assert!(whole.len() - bare.len() >= STANDARD_TABLES.len());
+        assert!(image::load_from_memory_with_format(&bare, ImageFormat::Jpeg).is_err(), "the tables are not missed");
+        let repaired = first_image(&bare).expect("whole but for its tables");
+        assert_eq!(pixels(&repaired), pixels(&whole));
+    }
+
+    #[test]
+    fn a_whole_image_is_not_copied_and_what_is_around_it_is_left_out() {
+        let whole = jpeg();
+        for (before, behind) in [(&b""[..], &b""[..]), (b"\xff\xffabc", b""), (b"", b"\0\0\0"), (b"\xff\xd9", b"\xff")]
+        {
+            let buffer = [before, &whole, behind].concat();
+            assert!(matches!(first_image(&buffer), Ok(Cow::Borrowed(found)) if found == whole));
+        }
+        // A restart marker and a stuffed 0xff among the coded data do not end it.
+        let mut coded = whole.clone();
+        coded.splice(whole.len() - 2..whole.len() - 2, [0xff, 0xd3, 0xff, 0x00, 0xff, 0xff]);
+        assert_eq!(first_image(&coded).as_deref(), Ok(&coded[..]));
+    }
+
+    #[test]
+    fn of_two_images_the_first_whole_one_is_found() {
+        let (first, second) = (jpeg(), without(&jpeg(), 0xe0));
+        assert_ne!(first, second);
+        assert_eq!(first_image(&[&first[..], &second].concat()).as_deref(), Ok(&first[..]));
+        // Not inside a segment: its length would reach into the second image.
+        for n_bytes in [2, 20, first.len() / 2, first.len() - 2] {
+            let buffer = [&first[..n_bytes], &second].concat();
+            assert_eq!(first_image(&buffer).as_deref(), Ok(&second[..]), "cut at {n_bytes}");
+        }
+    }
+
+    #[test]
+    fn a_cut_image_is_refused_wherever_it_is_cut() {
+        let whole = jpeg();
+        for n_bytes in (0..whole.len()).step_by(97).chain(0..40).chain(whole.len() - 40..whole.len()) {
+            let why = if n_bytes < 2 { NoJpeg::NoStart } else { NoJpeg::CutOff };
+            assert_eq!(first_image(&whole[..n_bytes]), Err(why), "{n_bytes} of {} bytes", whole.len());
+        }
+        // Bytes lost at any place never panic, whatever is found.
+        for lost in (0..whole.len()).step_by(97) {
+            let _ = first_image(&[&whole[..lost], &whole[(lost + 61).min(whole.len())..]].concat());
+        }
+    }
+
+    #[test]
+    fn a_thumbnail_is_part_of_the_image_around_it() {
+        let whole = jpeg();
+        let segment = [&[0xff, 0xe1, 0, 6][..], &[0xff, START_OF_IMAGE, 0xff, END_OF_IMAGE]].concat();
+        let with_thumbnail = [&whole[..2], &segment, &whole[2..]].concat();
+        assert_eq!(first_image(&with_thumbnail).as_deref(), Ok(&with_thumbnail[..]));
+        assert_eq!(first_image(&with_thumbnail[..with_thumbnail.len() - 100]), Err(NoJpeg::CutOff));
+        assert_eq!(first_image(&segment[4..]), Err(NoJpeg::NoPicture));
+    }
+}

@@ -1,0 +1,242 @@
+//! A V4L2 camera as the rest of the program sees it: images while it is plugged in, waiting while it is not.
+
+use super::running::Running;
+use super::{Config, Problem};
+use crate::{Camera, Error, Image};
+use kinematics::{Intrinsics, Stamp};
+use std::time::{Duration, Instant};
+
+/// Between two tries to find a lost camera again.
+const RETRY_PAUSE: Duration = Duration::from_millis(100);
+/// A stream that is silent for this long, or for so many images, is begun anew: cameras hang.
+const MAX_SILENCE: Duration = Duration::from_secs(2);
+const MAX_SILENT_IMAGES: f64 = 5.0;
+
+/// A V4L2 camera that streams.
+///
+/// A camera that is unplugged, or hangs, is opened again with the same settings, for at most [`Config::reconnect_for`]: until
+/// then [`Camera::next_image`] says [`Error::Reconnecting`], after that what it was. Images that would have come meanwhile count
+/// as skipped. Dropping it ends the stream.
+#[derive(Debug)]
+pub struct V4l2Camera {
+    config: Config,
+    link: Link,
+    counts: Counts,
+    /// Stamp of the last image, across reconnections.
+    last: Option<Stamp>,
+    /// Set from a loss to the next image.
+    outage: Option<Outage>,
+}
+
+/// A time without images.
+#[derive(Clone, Copy, Debug)]
+struct Outage {
+    since: Instant,
+    n_tries: u32,
+}
+
+/// What became of the camera since it was opened.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// Images delivered.
+    pub n_images: u64,
+    /// Images lost, all of which were told in [`Image::n_skipped`].
+    pub n_skipped: u64,
+    /// Of these: delivered by the device with damaged or too little data.
+    pub n_damaged: u64,
+    /// Times that it was found again.
+    pub n_reconnections: u32,
+}
+
+#[derive(Debug)]
+enum Link {
+    Up(Box<Running>),
+    Down { last_try: Instant },
+}
+
+impl V4l2Camera {
+    /// Opens a camera, sets it up as the rig file says, reads that back, and starts its stream.
+    pub fn open(config: Config) -> Result<Self, Error> {
+        if config.device.starts_with("/dev/video") {
+            let Config { name, device, .. } = &config;
+            log::warn!(
+                "camera {name:?}: {device} may be another camera tomorrow; `fieldrig devices` prints a name that stays"
+            );
+        }
+        let running = Running::start(&config)?;
+        log::info!("camera {:?}: {}", config.name, running.describe());
+        Ok(Self { config, link: Link::Up(Box::new(running)), counts: Counts::default(), last: None, outage: None })
+    }
+
+    /// What became of it so far.
+    pub fn counts(&self) -> Counts {
+        self.counts
+    }
+
+    /// What the camera told when its settings were read back, names and counts; empty while it is gone.
+    pub fn read_back(&self) -> &[(&'static str, i32)] {
+        match &self.link {
+            Link::Up(running) => running.read_back(),
+            Link::Down { .. } => &[],
+        }
+    }
+
+    /// One step of waiting for an image of a camera that is there.
+    fn wait_for_image(&mut self, deadline: Instant) -> Result<Option<Image>, Error> {
+        let Link::Up(running) = &mut self.link else { return Ok(None) };
+        let (n_damaged, image) = (running.n_damaged(), running.next_image(&self.config, deadline));
+        self.counts.n_damaged += running.n_damaged() - n_damaged;
+        let image = match image {
+            Ok(image) => image,
+            Err(problem) => return self.lose(problem).map(|()| None),
+        };
+        let waited = running.silent_for();
+        if image.is_none() && waited > MAX_SILENCE.max(Duration::from_secs_f64(MAX_SILENT_IMAGES / self.config.rate_hz))
+        {
+            self.lose(Problem::Silent { waited })?;
+        }
+        Ok(image.map(|image| self.count(image)))
+    }
+
+    fn count(&mut self, mut image: Image) -> Image {
+        if self.is_first_again() {
+            let by_time = self.last.map_or(0, |last| n_between(last, image.stamp, self.config.rate_hz));
+            image.n_skipped = image.n_skipped.max(by_time);
+        }
+        self.last = Some(image.stamp);
+        self.outage = None;
+        self.counts.n_images += 1;
+        self.counts.n_skipped += image.n_skipped;
+        image
+    }
+
+    /// Whether the image in hand is the first since the camera was opened, for the first time or again.
+    fn is_first_again(&self) -> bool {
+        matches!(&self.link, Link::Up(running) if running.n_images() == 1)
+    }
+
+    /// Closes the device before it is looked for: a node in use keeps its number. Fails when it has been lost for too long: a camera
+    /// that can be opened and sends nothing is lost, too.
+    fn lose(&mut self, why: Problem) -> Result<(), Error> {
+        let now = Instant::now();
+        let outage = *self.outage.get_or_insert(Outage { since: now, n_tries: 0 });
+        self.link = Link::Down { last_try: now };
+        if outage.n_tries > 0 {
+            return self.give_up_if_late(outage, why);
+        }
+        log::warn!("camera {:?}: {why}; looking for it for {:?}", self.config.name, self.config.reconnect_for);
+        Ok(())
+    }
+
+    /// The error of a camera that was lost for longer than the rig file allows.
+    fn give_up_if_late(&self, Outage { since, n_tries }: Outage, why: Problem) -> Result<(), Error> {
+        let (camera, waited) = (self.config.name.clone(), since.elapsed());
+        if waited < self.config.reconnect_for {
+            log::debug!("camera {camera:?}: {why}");
+            return Ok(());
+        }
+        Err(Error::V4l2 { camera, problem: Box::new(Problem::Lost { waited, n_tries, last: Box::new(why) }) })
+    }
+
+    /// One try to open a lost camera again, not before the pause since the last one is over.
+    fn reconnect(&mut self, deadline: Instant) -> Result<(), Error> {
+        let (Link::Down { last_try }, Some(outage)) = (&mut self.link, &mut self.outage) else { return Ok(()) };
+        let pause = if outage.n_tries == 0 { Duration::ZERO } else { RETRY_PAUSE };
+        let next_try = *last_try + pause;
+        if next_try > deadline {
+            std::thread::sleep(deadline.saturating_duration_since(Instant::now()));
+            return Err(Error::Reconnecting { camera: self.config.name.clone(), waited: outage.since.elapsed() });
+        }
+        std::thread::sleep(next_try.saturating_duration_since(Instant::now()));
+        outage.n_tries += 1;
+        *last_try = Instant::now();
+        let outage = *outage;
+        match Running::start(&self.config) {
+            Ok(running) => {
+                let Outage { since, n_tries } = outage;
+                let (camera, waited) = (&self.config.name, since.elapsed());
+                log::info!(
+                    "camera {camera:?}: there again after {waited:?} and {n_tries} tries: {}",
+                    running.describe()
+                );
+                self.counts.n_reconnections += 1;
+                self.link = Link::Up(Box::new(running));
+                Ok(())
+            }
+            Err(Error::V4l2 { problem, .. }) => self.give_up_if_late(outage, *problem),
+            Err(other) => Err(other),
+        }
+    }
+}
+
+/// Images that a rate puts between two stamps.
+fn n_between(last: Stamp, next: Stamp, rate_hz: f64) -> u64 {
+    let periods = next.0.saturating_sub(last.0) as f64 * 1e-9 * rate_hz;
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the cast saturates, which is meant")]
+    let n_images = (periods.round() - 1.0).max(0.0) as u64;
+    n_images
+}
+
+impl Camera for V4l2Camera {
+    fn name(&self) -> &str {
+        &self.config.name
+    }
+
+    fn intrinsics(&self) -> &Intrinsics {
+        &self.config.intrinsics
+    }
+
+    fn next_image(&mut self, timeout: Duration) -> Result<Image, Error> {
+        let deadline = Instant::now() + timeout;
+        loop {
+            match &self.link {
+                Link::Down { .. } => self.reconnect(deadline)?,
+                Link::Up(_) => {
+                    if let Some(image) = self.wait_for_image(deadline)? {
+                        return Ok(image);
+                    }
+                    if matches!(self.link, Link::Up(_)) {
+                        return Err(Error::NoImage { camera: self.config.name.clone(), waited: timeout });
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_outage_is_counted_in_images() {
+        let millis = |millis: i64| Stamp(millis * 1_000_000);
+        assert_eq!(n_between(millis(0), millis(33), 30.0), 0);
+        assert_eq!(n_between(millis(0), millis(100), 30.0), 2);
+        assert_eq!(n_between(millis(0), millis(1000), 30.0), 29);
+        assert_eq!(n_between(millis(1000), millis(0), 30.0), 0);
+    }
+
+    #[test]
+    fn a_camera_that_is_not_plugged_in_is_an_error_that_names_it() {
+        let config = Config {
+            name: "wrist".into(),
+            device: "no such serial".into(),
+            format: None,
+            intrinsics: Intrinsics {
+                size_px: [640, 480],
+                focal_px: [600.0; 2],
+                principal_px: [320.0, 240.0],
+                lens: kinematics::Lens::Pinhole,
+                rectified: true,
+            },
+            rate_hz: 30.0,
+            metres_per_count: None,
+            settings: super::super::Settings::default(),
+            delivery: super::super::Delivery::Every,
+            reconnect_for: Duration::from_secs(1),
+        };
+        let message = V4l2Camera::open(config).expect_err("nothing there").to_string();
+        assert!(message.contains("\"wrist\"") && message.contains("no such serial"), "{message}");
+    }
+}

@@ -1,0 +1,435 @@
+//! Exposure, gain, white balance and brightness: what is set for a rig file, in which order, and what is read back.
+//!
+//! Source: Linux `v4l2-controls.h` and its documentation of user and camera controls; numbers are the kernel's.
+
+use super::Problem;
+use super::abi::{self, QueryControl};
+use super::device::Device;
+use rustix::io::Errno;
+use std::io;
+
+/// Exposure counts of 100 us.
+const MICROS_PER_COUNT: f64 = 100.0;
+/// Cameras round an exposure to the rows of their sensor: so much may it be off when read back.
+const EXPOSURE_OFF_FRAC: f64 = 0.1;
+
+/// A control by the kernel's number.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u32)]
+pub(super) enum Id {
+    Brightness = 0x0098_0900,
+    AutoWhiteBalance = 0x0098_090c,
+    AutoGain = 0x0098_0912,
+    Gain = 0x0098_0913,
+    WhiteBalanceTemperature = 0x0098_091a,
+    ExposureAuto = 0x009a_0901,
+    ExposureAbsolute = 0x009a_0902,
+    /// `exposure_dynamic_framerate`: automatic exposure may lower the rate.
+    ExposureAutoPriority = 0x009a_0903,
+    AnalogueGain = 0x009e_0903,
+}
+
+/// Entries of the menu [`Id::ExposureAuto`].
+const EXPOSURE_FULLY_AUTOMATIC: i32 = 0;
+const EXPOSURE_MANUAL: i32 = 1;
+const EXPOSURE_SHUTTER_PRIORITY: i32 = 2;
+const EXPOSURE_APERTURE_PRIORITY: i32 = 3;
+
+/// What the rig file says of the picture; what it leaves open is automatic where the camera can do that, else left as it is.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Settings {
+    /// Exposure time, microseconds; `None` lets the camera choose at the rate it was asked for.
+    pub exposure_micros: Option<f64>,
+    /// Gain, counts of the camera.
+    pub gain: Option<i32>,
+    /// White balance, kelvin.
+    pub white_balance_kelvin: Option<i32>,
+    /// Brightness, counts of the camera.
+    pub brightness: Option<i32>,
+}
+
+/// One control to set.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Step {
+    control: &'static str,
+    id: Id,
+    value: i32,
+    /// How far off it may read back.
+    slack: i32,
+    /// Asked for by the rig file; else a camera that refuses is told of and left as it is.
+    is_asked_for: bool,
+}
+
+/// What the camera is set to, as it told itself.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Applied {
+    /// Exposure time where it is fixed and told, seconds.
+    pub(super) exposure_secs: Option<f64>,
+    /// Whether the exposure is automatic and can be asked for.
+    pub(super) tells_exposure: bool,
+    /// Names and values, for people.
+    pub(super) read_back: Vec<(&'static str, i32)>,
+}
+
+/// The controls of a camera: those of a [`Device`], and of tables in tests.
+pub(super) trait Controls {
+    fn find(&self, id: Id) -> Option<QueryControl>;
+    fn menu(&self, id: Id) -> Vec<i32>;
+    fn set(&self, id: Id, value: i32) -> Result<(), Errno>;
+    fn get(&self, id: Id) -> Result<i32, Errno>;
+}
+
+impl Controls for Device {
+    fn find(&self, id: Id) -> Option<QueryControl> {
+        self.control(id as u32)
+    }
+
+    fn menu(&self, id: Id) -> Vec<i32> {
+        let Some(control) = self.control(id as u32) else { return Vec::new() };
+        match control.kind {
+            abi::CONTROL_MENU => Self::menu(self, id as u32, control.minimum..=control.maximum.min(64)),
+            _ => (control.minimum..=control.maximum.min(64)).collect(),
+        }
+    }
+
+    fn set(&self, id: Id, value: i32) -> Result<(), Errno> {
+        self.set_control(id as u32, value)
+    }
+
+    fn get(&self, id: Id) -> Result<i32, Errno> {
+        self.control_value(id as u32)
+    }
+}
+
+/// Sets a camera, reads everything back, and compares.
+pub(super) fn apply(settings: &Settings, camera: &impl Controls) -> Result<Applied, Problem> {
+    let steps = plan(settings, camera)?;
+    for step in &steps {
+        match camera.set(step.id, step.value) {
+            Err(error) if step.is_asked_for || error == Errno::NODEV => return Err(refused(step.control, error)),
+            Err(error) => log::debug!("{}: {error}", step.control),
+            Ok(()) => {}
+        }
+    }
+    check(settings, camera, &steps)
+}
+
+/// Compares again once images come, for some cameras forget their settings when a stream begins; sets them once more if so.
+pub(super) fn confirm(settings: &Settings, camera: &impl Controls) -> Result<Applied, Problem> {
+    match check(settings, camera, &plan(settings, camera)?) {
+        Err(Problem::ReadBack { .. }) => apply(settings, camera),
+        other => other,
+    }
+}
+
+/// Reads back what was set, and compares.
+fn check(settings: &Settings, camera: &impl Controls, steps: &[Step]) -> Result<Applied, Problem> {
+    let mut applied = Applied::default();
+    for step in steps {
+        let got = match camera.get(step.id) {
+            Ok(got) => got,
+            Err(error) if step.is_asked_for || error == Errno::NODEV => return Err(refused(step.control, error)),
+            Err(_) => continue,
+        };
+        if step.is_asked_for && got.abs_diff(step.value) > step.slack.unsigned_abs() {
+            return Err(Problem::ReadBack { control: step.control, wanted: step.value, got });
+        }
+        if step.id == Id::ExposureAbsolute {
+            applied.exposure_secs = Some(secs_of_counts(got));
+        }
+        // What was not asked for and came out otherwise is to be seen there.
+        applied.read_back.push((step.control, got));
+    }
+    if settings.exposure_micros.is_none() {
+        applied.tells_exposure = exposure_secs(camera).is_some();
+    } else if applied.exposure_secs.is_none() {
+        // It cannot be set: then the rig file knows it.
+        applied.exposure_secs = settings.exposure_micros.map(|micros| micros * 1e-6);
+    }
+    Ok(applied)
+}
+
+/// The exposure time that a camera tells, seconds.
+pub(super) fn exposure_secs(camera: &impl Controls) -> Option<f64> {
+    let counts = camera.get(Id::ExposureAbsolute).ok()?;
+    (counts > 0).then(|| secs_of_counts(counts))
+}
+
+fn secs_of_counts(counts: i32) -> f64 {
+    f64::from(counts) * MICROS_PER_COUNT * 1e-6
+}
+
+fn refused(control: &'static str, error: Errno) -> Problem {
+    match error {
+        Errno::NODEV => Problem::Unplugged { source: error.into() },
+        _ => Problem::Refused { what: control, source: io::Error::from(error) },
+    }
+}
+
+/// What is set, in order: what is automatic first, for a value that automation holds cannot be set.
+fn plan(settings: &Settings, camera: &impl Controls) -> Result<Vec<Step>, Problem> {
+    let mut steps = Vec::new();
+    exposure(settings.exposure_micros, camera, &mut steps)?;
+    let gain_id = [Id::Gain, Id::AnalogueGain].into_iter().find(|id| camera.find(*id).is_some());
+    let gain = Lock { auto: ("automatic gain", Id::AutoGain), fixed: ("v4l2.gain", gain_id.unwrap_or(Id::Gain)) };
+    gain.plan(settings.gain, camera, &mut steps)?;
+    let balance = Lock {
+        auto: ("automatic white balance", Id::AutoWhiteBalance),
+        fixed: ("v4l2.white_balance_kelvin", Id::WhiteBalanceTemperature),
+    };
+    balance.plan(settings.white_balance_kelvin, camera, &mut steps)?;
+    if let Some(value) = settings.brightness {
+        steps.push(fixed("v4l2.brightness", Id::Brightness, value, camera)?);
+    }
+    Ok(steps)
+}
+
+/// A value that a camera may choose itself.
+struct Lock {
+    auto: (&'static str, Id),
+    fixed: (&'static str, Id),
+}
+
+impl Lock {
+    fn plan(&self, value: Option<i32>, camera: &impl Controls, steps: &mut Vec<Step>) -> Result<(), Problem> {
+        let (control, id) = self.auto;
+        if camera.find(id).is_some() {
+            let is_asked_for = value.is_some();
+            steps.push(Step { control, id, value: i32::from(!is_asked_for), slack: 0, is_asked_for });
+        }
+        if let Some(value) = value {
+            steps.push(fixed(self.fixed.0, self.fixed.1, value, camera)?);
+        }
+        Ok(())
+    }
+}
+
+/// A value that has to be within the range and on the steps of its control.
+fn fixed(control: &'static str, id: Id, value: i32, camera: &impl Controls) -> Result<Step, Problem> {
+    let known = camera.find(id).ok_or(Problem::NoControl { control })?;
+    let step = known.step.max(1);
+    let is_known = (known.minimum..=known.maximum).contains(&value)
+        && (i64::from(value) - i64::from(known.minimum)) % i64::from(step) == 0;
+    if !is_known {
+        return Err(Problem::ControlRange {
+            control,
+            wanted: value.into(),
+            least: known.minimum.into(),
+            most: known.maximum.into(),
+            step: step.into(),
+        });
+    }
+    Ok(Step { control, id, value, slack: 0, is_asked_for: true })
+}
+
+/// Exposure: the mode, that automation keeps the rate, and the time where it is fixed.
+fn exposure(micros: Option<f64>, camera: &impl Controls, steps: &mut Vec<Step>) -> Result<(), Problem> {
+    let entries = camera.menu(Id::ExposureAuto);
+    let candidates = match micros {
+        // Cameras without an iris call "automatic" what photographers call aperture priority.
+        None => [EXPOSURE_APERTURE_PRIORITY, EXPOSURE_FULLY_AUTOMATIC],
+        Some(_) => [EXPOSURE_MANUAL, EXPOSURE_SHUTTER_PRIORITY],
+    };
+    if let Some(value) = candidates.into_iter().find(|entry| entries.contains(entry)) {
+        let is_asked_for = micros.is_some();
+        steps.push(Step { control: "exposure mode", id: Id::ExposureAuto, value, slack: 0, is_asked_for });
+    }
+    if camera.find(Id::ExposureAutoPriority).is_some() {
+        let control = "exposure_dynamic_framerate";
+        steps.push(Step { control, id: Id::ExposureAutoPriority, value: 0, slack: 0, is_asked_for: false });
+    }
+    let Some(micros) = micros else { return Ok(()) };
+    let Some(known) = camera.find(Id::ExposureAbsolute) else { return Ok(()) };
+    let step = f64::from(known.step.max(1));
+    let nearest =
+        ((micros / MICROS_PER_COUNT - f64::from(known.minimum)) / step).round() * step + f64::from(known.minimum);
+    // A time shorter than half a step of the shortest is not what was asked for.
+    let counts = (f64::from(known.minimum)..=f64::from(known.maximum)).contains(&nearest).then_some(nearest);
+    #[expect(clippy::cast_possible_truncation, reason = "within the range of the control, which is 32 bits wide")]
+    let value = counts.map(|counts| counts as i32).ok_or(Problem::ControlRange {
+        control: "exposure_micros",
+        wanted: micros,
+        least: f64::from(known.minimum) * MICROS_PER_COUNT,
+        most: f64::from(known.maximum) * MICROS_PER_COUNT,
+        step: step * MICROS_PER_COUNT,
+    })?;
+    #[expect(clippy::cast_possible_truncation, reason = "a tenth of 32 bits")]
+    let slack = (f64::from(value) * EXPOSURE_OFF_FRAC) as i32;
+    let slack = slack.max(known.step);
+    steps.push(Step { control: "exposure_micros", id: Id::ExposureAbsolute, value, slack, is_asked_for: true });
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::cell::RefCell;
+    use std::collections::BTreeMap;
+
+    /// A camera by a table of its controls: number, least, most, step.
+    struct Table {
+        controls: &'static [(Id, i32, i32, i32)],
+        exposure_modes: &'static [i32],
+    }
+
+    /// Such a camera with the values it has now, by the kernel's numbers; it refuses to be set where it says so.
+    struct Switched {
+        table: Table,
+        values: RefCell<BTreeMap<u32, i32>>,
+        refuses: &'static [Id],
+    }
+
+    impl Controls for Switched {
+        fn find(&self, id: Id) -> Option<QueryControl> {
+            self.table.find(id)
+        }
+
+        fn menu(&self, id: Id) -> Vec<i32> {
+            self.table.menu(id)
+        }
+
+        fn set(&self, id: Id, value: i32) -> Result<(), Errno> {
+            if self.refuses.contains(&id) {
+                return Err(Errno::IO);
+            }
+            // Sensors expose whole rows: what is near is what they take.
+            let taken = if id == Id::ExposureAbsolute { value - 1 } else { value };
+            self.values.borrow_mut().insert(id as u32, taken);
+            Ok(())
+        }
+
+        fn get(&self, id: Id) -> Result<i32, Errno> {
+            self.find(id).ok_or(Errno::INVAL)?;
+            Ok(self.values.borrow().get(&(id as u32)).copied().unwrap_or(0))
+        }
+    }
+
+    fn switched(table: Table, refuses: &'static [Id]) -> Switched {
+        Switched { table, values: RefCell::default(), refuses }
+    }
+
+    impl Controls for Table {
+        fn find(&self, id: Id) -> Option<QueryControl> {
+            let (_, minimum, maximum, step) = *self.controls.iter().find(|control| control.0 == id)?;
+            Some(QueryControl { id: id as u32, minimum, maximum, step, ..Default::default() })
+        }
+
+        fn menu(&self, _: Id) -> Vec<i32> {
+            self.exposure_modes.to_vec()
+        }
+
+        fn set(&self, _: Id, _: i32) -> Result<(), Errno> {
+            Err(Errno::ACCESS)
+        }
+
+        fn get(&self, _: Id) -> Result<i32, Errno> {
+            Err(Errno::ACCESS)
+        }
+    }
+
+    /// Logitech C920 as `v4l2-ctl -L` prints it (kernel 5.15, firmware 0.0.15).
+    const C920: Table = Table {
+        controls: &[
+            (Id::Brightness, 0, 255, 1),
+            (Id::AutoWhiteBalance, 0, 1, 1),
+            (Id::Gain, 0, 255, 1),
+            (Id::WhiteBalanceTemperature, 2000, 6500, 1),
+            (Id::ExposureAuto, 0, 3, 1),
+            (Id::ExposureAbsolute, 3, 2047, 1),
+            (Id::ExposureAutoPriority, 0, 1, 1),
+        ],
+        exposure_modes: &[1, 3],
+    };
+
+    /// The test driver vivid.
+    const VIVID: Table = Table {
+        controls: &[(Id::Brightness, 0, 255, 1), (Id::AutoGain, 0, 1, 1), (Id::Gain, 0, 255, 1)],
+        exposure_modes: &[],
+    };
+
+    fn planned(settings: &Settings, camera: &Table) -> Vec<(Id, i32)> {
+        plan(settings, camera).expect("it can").iter().map(|step| (step.id, step.value)).collect()
+    }
+
+    #[test]
+    fn what_the_rig_file_leaves_open_is_automatic_and_keeps_the_rate() {
+        let automatic = planned(&Settings::default(), &C920);
+        let wanted = [(Id::ExposureAuto, 3), (Id::ExposureAutoPriority, 0), (Id::AutoWhiteBalance, 1)];
+        assert_eq!(automatic, wanted);
+        assert_eq!(planned(&Settings::default(), &VIVID), [(Id::AutoGain, 1)]);
+    }
+
+    #[test]
+    fn what_it_fixes_is_set_after_its_automation_is_off() {
+        let settings = Settings {
+            exposure_micros: Some(4040.0),
+            gain: Some(12),
+            white_balance_kelvin: Some(4600),
+            brightness: Some(100),
+        };
+        let wanted = [
+            (Id::ExposureAuto, 1),
+            (Id::ExposureAutoPriority, 0),
+            (Id::ExposureAbsolute, 40),
+            (Id::Gain, 12),
+            (Id::AutoWhiteBalance, 0),
+            (Id::WhiteBalanceTemperature, 4600),
+            (Id::Brightness, 100),
+        ];
+        assert_eq!(planned(&settings, &C920), wanted);
+        let gain = Settings { gain: Some(12), ..Settings::default() };
+        assert_eq!(planned(&gain, &VIVID), [(Id::AutoGain, 0), (Id::Gain, 12)]);
+    }
+
+    #[test]
+    fn what_a_camera_cannot_do_is_told_with_what_it_can() {
+        let refuse = |settings: &Settings, camera: &Table| plan(settings, camera).expect_err("it cannot").to_string();
+        let dark = Settings { exposure_micros: Some(100.0), ..Settings::default() };
+        assert_eq!(refuse(&dark, &C920), "exposure_micros is 100, it takes 300 to 204700 in steps of 100");
+        let loud = Settings { gain: Some(256), ..Settings::default() };
+        assert_eq!(refuse(&loud, &C920), "v4l2.gain is 256, it takes 0 to 255 in steps of 1");
+        let warm = Settings { white_balance_kelvin: Some(4600), ..Settings::default() };
+        assert_eq!(refuse(&warm, &VIVID), "it has no control for v4l2.white_balance_kelvin: leave the key out");
+        const COARSE: Table = Table { controls: &[(Id::Gain, 0, 100, 10)], exposure_modes: &[] };
+        let off = Settings { gain: Some(15), ..Settings::default() };
+        assert!(refuse(&off, &COARSE).ends_with("it takes 0 to 100 in steps of 10"));
+    }
+
+    #[test]
+    fn a_camera_without_exposure_control_is_not_refused() {
+        // The key then says what is known of it, as docs/rig.md tells.
+        let known = Settings { exposure_micros: Some(4000.0), ..Settings::default() };
+        assert_eq!(planned(&known, &VIVID), [(Id::AutoGain, 1)]);
+    }
+
+    #[test]
+    fn what_was_set_is_read_back_and_set_again_where_a_stream_changed_it() {
+        let settings = Settings { exposure_micros: Some(4000.0), gain: Some(12), ..Settings::default() };
+        let camera = switched(C920, &[]);
+        let applied = apply(&settings, &camera).expect("it takes all");
+        assert_eq!(applied.exposure_secs, Some(secs_of_counts(39)), "what the camera made of it");
+        assert!(applied.read_back.contains(&("v4l2.gain", 12)) && !applied.tells_exposure);
+        camera.values.borrow_mut().insert(Id::Gain as u32, 64);
+        assert!(confirm(&settings, &camera).expect("set again").read_back.contains(&("v4l2.gain", 12)));
+        assert_eq!(camera.get(Id::Gain), Ok(12));
+        assert!((secs_of_counts(39) - 0.0039).abs() < 1e-12, "counts of 100 us");
+        // With automatic exposure it is asked for with each image.
+        camera.values.borrow_mut().insert(Id::ExposureAbsolute as u32, 156);
+        let automatic = apply(&Settings::default(), &camera).expect("it takes all");
+        assert!(automatic.tells_exposure && automatic.exposure_secs.is_none());
+        assert_eq!(exposure_secs(&camera), Some(secs_of_counts(156)));
+    }
+
+    #[test]
+    fn only_what_the_rig_file_asks_for_has_to_be_taken() {
+        let camera = switched(C920, &[Id::ExposureAuto, Id::ExposureAutoPriority, Id::AutoWhiteBalance, Id::Gain]);
+        assert!(apply(&Settings::default(), &camera).is_ok(), "nothing was asked for");
+        let gain = Settings { gain: Some(12), ..Settings::default() };
+        let message = apply(&gain, &camera).expect_err("it refuses").to_string();
+        assert!(message.contains("v4l2.gain"), "{message}");
+        // A camera that takes it and does otherwise.
+        let steps = plan(&gain, &C920).expect("it can");
+        let message = check(&gain, &camera, &steps).expect_err("it reads 0").to_string();
+        assert_eq!(message, "v4l2.gain was set to 12 and reads 0");
+    }
+}

@@ -1,0 +1,331 @@
+//! One open V4L2 device: the kernel's requests as safe calls, and images in memory that the kernel shares.
+
+use super::abi::{self, Plain, Request};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::fd::{AsFd, OwnedFd};
+use rustix::fs::{Mode, OFlags};
+use rustix::io::Errno;
+use rustix::ioctl::{Ioctl, IoctlOutput, Opcode};
+use rustix::mm::{MapFlags, ProtFlags};
+use std::ffi::c_void;
+use std::path::Path;
+use std::time::Duration;
+
+/// An open device. Dropping it ends its stream and closes it.
+#[derive(Debug)]
+pub(super) struct Device {
+    fd: OwnedFd,
+}
+
+/// What a device says it is.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Identity {
+    /// What it calls itself.
+    pub(super) card: String,
+    /// Where it is plugged in.
+    pub(super) bus: String,
+    /// The node gives images (others of the same camera may give metadata), and gives them by streaming.
+    pub(super) streams_images: bool,
+}
+
+/// An image that the device has filled.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Filled {
+    index: u32,
+    n_bytes: usize,
+    /// Images since the stream began, lost ones counted.
+    pub(super) sequence: u32,
+    /// When, on the clock that `is_monotonic` tells, nanoseconds.
+    pub(super) stamp_nanos: i64,
+    /// Whether the device says that its stamps are of the kernel's monotonic clock.
+    pub(super) is_monotonic: bool,
+    /// The device says that the data are damaged.
+    pub(super) is_damaged: bool,
+}
+
+/// Carries a structure to the kernel and back.
+struct Exchange<'a, T> {
+    code: Opcode,
+    value: &'a mut T,
+}
+
+// SAFETY: the kernel writes at most the structure whose size is in the code, and `Request` pairs each code with its structure;
+// the sizes are asserted in `abi`. The structures are plain integers: whatever is written is a value of them.
+#[expect(unsafe_code, reason = "the kernel's border")]
+unsafe impl<T: Plain> Ioctl for Exchange<'_, T> {
+    type Output = ();
+    const IS_MUTATING: bool = true;
+
+    fn opcode(&self) -> Opcode {
+        self.code
+    }
+
+    fn as_ptr(&mut self) -> *mut c_void {
+        std::ptr::from_mut(self.value).cast()
+    }
+
+    unsafe fn output_from_ptr(_: IoctlOutput, _: *mut c_void) -> rustix::io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Device {
+    /// Opens a node, not waiting for it.
+    pub(super) fn open(path: &Path) -> rustix::io::Result<Self> {
+        let flags = OFlags::RDWR | OFlags::NONBLOCK | OFlags::CLOEXEC;
+        Ok(Self { fd: rustix::fs::open(path, flags, Mode::empty())? })
+    }
+
+    /// One request; repeated when a signal cuts it short.
+    fn ask<T: Plain>(&self, request: &Request<T>, value: &mut T) -> rustix::io::Result<()> {
+        rustix::io::retry_on_intr(|| {
+            // SAFETY: the code belongs to the structure `T` (see `Exchange`), which outlives the call; none of the structures
+            // holds a pointer for the kernel to follow.
+            #[expect(unsafe_code, reason = "the kernel's border")]
+            unsafe {
+                rustix::ioctl::ioctl(&self.fd, Exchange { code: request.code(), value: &mut *value })
+            }
+        })
+    }
+
+    /// Asks with rising indices until the device has no more; a device without this request has none at all.
+    fn list<T: Plain>(&self, request: &Request<T>, mut of_index: impl FnMut(u32) -> T) -> Vec<T> {
+        const MOST: u32 = 1000; // A driver that never ends its list must not hold us.
+        let entry = |index| {
+            let mut entry = of_index(index);
+            self.ask(request, &mut entry).is_ok().then_some(entry)
+        };
+        (0..MOST).map_while(entry).collect()
+    }
+
+    pub(super) fn identity(&self) -> rustix::io::Result<Identity> {
+        let mut told = abi::Capability::default();
+        self.ask(&abi::QUERYCAP, &mut told)?;
+        let of_node = if told.capabilities & abi::CAP_DEVICE_CAPS == 0 { told.capabilities } else { told.device_caps };
+        let needed = abi::CAP_VIDEO_CAPTURE | abi::CAP_STREAMING;
+        Ok(Identity {
+            card: abi::text(&told.card),
+            bus: abi::text(&told.bus_info),
+            streams_images: of_node & needed == needed,
+        })
+    }
+
+    /// Codes of the pixel formats on offer, in the device's order.
+    pub(super) fn fourccs(&self) -> Vec<u32> {
+        let of_index = |index| abi::FormatDescription { index, kind: abi::VIDEO_CAPTURE, ..Default::default() };
+        self.list(&abi::ENUM_FMT, of_index).iter().map(|format| format.fourcc).collect()
+    }
+
+    /// Sizes on offer in a format.
+    pub(super) fn sizes(&self, fourcc: u32) -> Vec<abi::FrameSize> {
+        self.list(&abi::ENUM_FRAMESIZES, |index| abi::FrameSize { index, fourcc, ..Default::default() })
+    }
+
+    /// Times between images on offer in a format at a size.
+    pub(super) fn intervals(&self, fourcc: u32, [width, height]: [u32; 2]) -> Vec<abi::FrameInterval> {
+        let of_index = |index| abi::FrameInterval { index, fourcc, width, height, ..Default::default() };
+        self.list(&abi::ENUM_FRAMEINTERVALS, of_index)
+    }
+
+    /// Asks for a format and tells what the device made of it.
+    pub(super) fn set_format(&self, fourcc: u32, [width, height]: [u32; 2]) -> rustix::io::Result<abi::PixFormat> {
+        let pix = abi::PixFormat { width, height, fourcc, field: abi::FIELD_NONE, ..Default::default() };
+        let mut format = abi::Format { kind: abi::VIDEO_CAPTURE, padding: 0, pix, rest: [0; 19] };
+        self.ask(&abi::S_FMT, &mut format)?;
+        Ok(format.pix)
+    }
+
+    /// Asks for a rate, images a second, and tells what the device made of it; `None` where it has a rate of its own.
+    pub(super) fn set_rate_hz(&self, rate_hz: f64) -> rustix::io::Result<Option<f64>> {
+        let mut parm = abi::StreamParm { kind: abi::VIDEO_CAPTURE, capture: Default::default(), rest: [0; 40] };
+        if self.ask(&abi::G_PARM, &mut parm).is_err() || parm.capture.capability & abi::CAP_TIMEPERFRAME == 0 {
+            return Ok(None);
+        }
+        parm.capture.time_per_frame = super::format::interval_of(rate_hz);
+        self.ask(&abi::S_PARM, &mut parm)?;
+        Ok(Some(super::format::rate_of(parm.capture.time_per_frame)))
+    }
+
+    /// Whether what it receives are high-definition television signals, as of an HDMI grabber.
+    pub(super) fn is_hdtv(&self) -> bool {
+        let mut index = 0;
+        if self.ask(&abi::G_INPUT, &mut index).is_err() {
+            return false;
+        }
+        let mut input = abi::Input { index, ..Default::default() };
+        self.ask(&abi::ENUMINPUT, &mut input).is_ok() && input.capabilities & abi::INPUT_DV_TIMINGS != 0
+    }
+
+    /// What a control is; `None` where the device has none of this number that can be set.
+    pub(super) fn control(&self, id: u32) -> Option<abi::QueryControl> {
+        let mut control = abi::QueryControl { id, ..Default::default() };
+        self.ask(&abi::QUERYCTRL, &mut control).ok()?;
+        (control.flags & (abi::CONTROL_DISABLED | abi::CONTROL_READ_ONLY) == 0).then_some(control)
+    }
+
+    /// The entries of a menu control that this device has.
+    pub(super) fn menu(&self, id: u32, range: std::ops::RangeInclusive<i32>) -> Vec<i32> {
+        let has = |entry: &i32| {
+            u32::try_from(*entry).is_ok_and(|index| {
+                self.ask(&abi::QUERYMENU, &mut abi::QueryMenu { id, index, ..Default::default() }).is_ok()
+            })
+        };
+        range.filter(has).collect()
+    }
+
+    pub(super) fn control_value(&self, id: u32) -> rustix::io::Result<i32> {
+        let mut control = abi::Control { id, value: 0 };
+        self.ask(&abi::G_CTRL, &mut control)?;
+        Ok(control.value)
+    }
+
+    pub(super) fn set_control(&self, id: u32, value: i32) -> rustix::io::Result<()> {
+        self.ask(&abi::S_CTRL, &mut abi::Control { id, value })
+    }
+
+    /// Gives the device `n_buffers` to fill (it may take more or fewer) and lets it begin.
+    pub(super) fn stream(self, n_buffers: u32) -> Result<Stream, Refused> {
+        let mut wanted = abi::RequestBuffers {
+            count: n_buffers,
+            kind: abi::VIDEO_CAPTURE,
+            memory: abi::MEMORY_MMAP,
+            ..Default::default()
+        };
+        self.ask(&abi::REQBUFS, &mut wanted).map_err(Refused::Buffers)?;
+        let mut buffers = Vec::new();
+        for index in 0..wanted.count {
+            let mut buffer = buffer_of(index);
+            self.ask(&abi::QUERYBUF, &mut buffer).map_err(Refused::Buffers)?;
+            buffers.push(Mapped::new(&self.fd, &buffer).map_err(Refused::Buffers)?);
+            self.ask(&abi::QBUF, &mut buffer_of(index)).map_err(Refused::Buffers)?;
+        }
+        self.ask(&abi::STREAMON, &mut abi::VIDEO_CAPTURE.clone()).map_err(Refused::Begin)?;
+        Ok(Stream { device: self, buffers })
+    }
+}
+
+/// At which step a stream was refused.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Refused {
+    /// No memory for images, or another program has them.
+    Buffers(Errno),
+    /// `STREAMON`: mostly the bandwidth of USB.
+    Begin(Errno),
+}
+
+/// A device that sends images.
+#[derive(Debug)]
+pub(super) struct Stream {
+    device: Device,
+    buffers: Vec<Mapped>,
+}
+
+impl Stream {
+    pub(super) fn device(&self) -> &Device {
+        &self.device
+    }
+
+    /// Waits until an image is there (`true`) or the time is over; fails when the device is gone.
+    pub(super) fn wait(&self, timeout: Duration) -> rustix::io::Result<bool> {
+        let mut waited = [PollFd::new(&self.device.fd, PollFlags::IN)];
+        let timeout = Timespec {
+            tv_sec: i64::try_from(timeout.as_secs()).unwrap_or(i64::MAX),
+            tv_nsec: timeout.subsec_nanos().into(),
+        };
+        match poll(&mut waited, Some(&timeout)) {
+            Err(Errno::INTR) => Ok(false),
+            Err(error) => Err(error),
+            Ok(_) => Ok(!waited[0].revents().is_empty()), // Errors too: taking the image tells which.
+        }
+    }
+
+    /// Takes the oldest filled image out of the queue; `None` when none is filled. It has to be given [back](Self::give_back).
+    pub(super) fn take(&mut self) -> rustix::io::Result<Option<Filled>> {
+        let mut buffer = buffer_of(0);
+        match self.device.ask(&abi::DQBUF, &mut buffer) {
+            Ok(()) => {}
+            Err(Errno::AGAIN) => return Ok(None),
+            Err(error) => return Err(error),
+        }
+        Ok(Some(Filled {
+            index: buffer.index,
+            n_bytes: buffer.bytes_used as usize,
+            sequence: buffer.sequence,
+            stamp_nanos: buffer.secs.saturating_mul(1_000_000_000).saturating_add(buffer.micros.saturating_mul(1000)),
+            is_monotonic: buffer.flags & abi::BUFFER_CLOCK_MASK == abi::BUFFER_CLOCK_MONOTONIC,
+            is_damaged: buffer.flags & abi::BUFFER_ERROR != 0,
+        }))
+    }
+
+    /// The bytes of an image that was taken; fewer than it says where it says more than there is room for.
+    pub(super) fn bytes(&self, filled: &Filled) -> &[u8] {
+        let Some(mapped) = self.buffers.get(filled.index as usize) else { return &[] };
+        let whole = mapped.bytes();
+        &whole[..filled.n_bytes.min(whole.len())]
+    }
+
+    /// Lets the device fill it again.
+    pub(super) fn give_back(&mut self, filled: Filled) -> rustix::io::Result<()> {
+        self.device.ask(&abi::QBUF, &mut buffer_of(filled.index))
+    }
+}
+
+impl Drop for Stream {
+    fn drop(&mut self) {
+        // A device that is gone has stopped already.
+        let _ = self.device.ask(&abi::STREAMOFF, &mut abi::VIDEO_CAPTURE.clone());
+    }
+}
+
+fn buffer_of(index: u32) -> abi::Buffer {
+    abi::Buffer { index, kind: abi::VIDEO_CAPTURE, memory: abi::MEMORY_MMAP, ..Default::default() }
+}
+
+/// Memory of an image that the kernel shares with us.
+#[derive(Debug)]
+struct Mapped {
+    start: *mut c_void,
+    n_bytes: usize,
+}
+
+// SAFETY: the mapping belongs to this value alone and may be read from any thread.
+#[expect(unsafe_code, reason = "a pointer into shared memory")]
+unsafe impl Send for Mapped {}
+
+impl Mapped {
+    fn new(fd: impl AsFd, buffer: &abi::Buffer) -> rustix::io::Result<Self> {
+        let n_bytes = buffer.length as usize;
+        // SAFETY: a new mapping, placed by the kernel, read only; it lives until `drop`.
+        #[expect(unsafe_code, reason = "the kernel's border")]
+        let start = unsafe {
+            rustix::mm::mmap(
+                std::ptr::null_mut(),
+                n_bytes,
+                ProtFlags::READ,
+                MapFlags::SHARED,
+                fd,
+                u64::from(buffer.offset),
+            )?
+        };
+        Ok(Self { start, n_bytes })
+    }
+
+    fn bytes(&self) -> &[u8] {
+        // SAFETY: `n_bytes` are mapped for reading as long as this value lives. The device writes only between `QBUF` and
+        // `DQBUF`, and `give_back` needs the stream for itself, so no slice is left then. A device that breaks this would show torn
+        // pixels: bytes have no invalid values, and nothing here decides twice on the same byte.
+        #[expect(unsafe_code, reason = "memory that the kernel shares")]
+        unsafe {
+            std::slice::from_raw_parts(self.start.cast::<u8>(), self.n_bytes)
+        }
+    }
+}
+
+impl Drop for Mapped {
+    fn drop(&mut self) {
+        // SAFETY: mapped in `new` with this length; no slice of it outlives `self`.
+        #[expect(unsafe_code, reason = "the kernel's border")]
+        let unmapped = unsafe { rustix::mm::munmap(self.start, self.n_bytes) };
+        debug_assert!(unmapped.is_ok(), "an own mapping can be taken away: {unmapped:?}");
+    }
+}

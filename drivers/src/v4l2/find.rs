@@ -1,0 +1,231 @@
+//! Which V4L2 devices are plugged in, by names that stay the same from boot to boot.
+
+use super::Problem;
+use super::device::Device;
+use super::format::{self, Mode, Rates, Sizes, V4l2Format};
+use std::path::{Path, PathBuf};
+
+/// One node of a V4L2 device that gives images.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Found {
+    /// The node, whose number may change: `/dev/video0`.
+    pub node: PathBuf,
+    /// What it calls itself.
+    pub name: String,
+    /// Where it is plugged in, as the kernel tells: `usb-0000:00:14.0-2`.
+    pub bus: String,
+    /// Serial number on USB, where it has one.
+    pub serial: Option<String>,
+    /// The links of udev that stay the same: by device, then by port.
+    pub links: Vec<PathBuf>,
+    /// Speed of its USB, megabits a second.
+    pub usb_mbits: Option<f64>,
+    /// All that it offers of what is read here.
+    pub modes: Vec<Mode>,
+}
+
+impl Found {
+    /// What to write into a rig file: a link of udev, else its serial number, else where it is plugged in.
+    pub fn address(&self) -> String {
+        let link = self.links.first().map(|link| link.display().to_string());
+        link.or_else(|| self.serial.clone()).unwrap_or_else(|| self.bus.clone())
+    }
+
+    /// Bytes a second that its USB carries to one camera; `None` elsewhere.
+    pub fn usb_bytes_per_sec(&self) -> Option<f64> {
+        self.usb_mbits.map(format::usb_bytes_per_sec)
+    }
+
+    /// What it offers that its USB cannot carry, for people.
+    pub fn beyond_usb(&self) -> Vec<String> {
+        self.usb_bytes_per_sec().map_or(Vec::new(), |bytes_per_sec| format::beyond(&self.modes, bytes_per_sec))
+    }
+}
+
+/// What sysfs tells of a node without opening it.
+#[derive(Clone, Debug, PartialEq)]
+struct Node {
+    path: PathBuf,
+    /// Its USB device in sysfs; a camera's nodes share it.
+    usb: Option<PathBuf>,
+    serial: Option<String>,
+    usb_mbits: Option<f64>,
+}
+
+/// All that give images, and why the others cannot be opened; nodes of metadata are left out.
+pub fn cameras() -> Vec<Result<Found, Problem>> {
+    let root = Path::new("/");
+    nodes(root).into_iter().filter_map(|node| describe(root, node).transpose()).collect()
+}
+
+fn describe(root: &Path, node: Node) -> Result<Option<Found>, Problem> {
+    let device =
+        Device::open(&node.path).map_err(|error| Problem::Open { path: node.path.clone(), source: error.into() })?;
+    let Some(identity) = device.identity().ok().filter(|identity| identity.streams_images) else { return Ok(None) };
+    Ok(Some(Found {
+        name: identity.card,
+        bus: identity.bus,
+        serial: node.serial,
+        links: links_to(root, &node.path),
+        usb_mbits: node.usb_mbits,
+        modes: modes(&device),
+        node: node.path,
+    }))
+}
+
+/// All that a device offers of what is read here.
+pub(super) fn modes(device: &Device) -> Vec<Mode> {
+    let mut modes = Vec::new();
+    for fourcc in device.fourccs() {
+        let Some(format) = V4l2Format::from_fourcc(fourcc) else { continue };
+        for size in device.sizes(fourcc) {
+            let sizes = Sizes::from_kernel(&size);
+            let rates = Rates::from_kernel(&device.intervals(fourcc, sizes.most()));
+            modes.push(Mode { fourcc, format, sizes, rates });
+        }
+    }
+    modes
+}
+
+/// The nodes that a rig file may mean by `device`: a path, or a serial number or place shared by a camera's nodes.
+pub(super) fn candidates(device: &str) -> Result<Vec<PathBuf>, Problem> {
+    if device.starts_with('/') {
+        return Ok(vec![PathBuf::from(device)]);
+    }
+    let sits_there = |node: &Node| {
+        Device::open(&node.path).and_then(|open| open.identity()).is_ok_and(|identity| identity.bus == device)
+    };
+    let is_meant = |node: &Node| node.serial.as_deref() == Some(device) || sits_there(node);
+    let found = nodes(Path::new("/")).into_iter().filter(is_meant).collect();
+    one_camera(device, found)
+}
+
+/// The paths of nodes once they are known to be of one camera: makers give serial numbers twice.
+fn one_camera(device: &str, found: Vec<Node>) -> Result<Vec<PathBuf>, Problem> {
+    let device = device.to_owned();
+    let is_one = found.windows(2).all(|pair| pair[0].usb == pair[1].usb);
+    let paths: Vec<_> = found.into_iter().map(|node| node.path).collect();
+    match paths.len() {
+        0 => Err(Problem::NoDevice { device }),
+        _ if !is_one => Err(Problem::Ambiguous { device, nodes: paths }),
+        _ => Ok(paths),
+    }
+}
+
+/// Every video node that sysfs knows, in the order of their numbers.
+fn nodes(root: &Path) -> Vec<Node> {
+    let class = root.join("sys/class/video4linux");
+    let number = |name: &str| name.strip_prefix("video")?.parse::<u32>().ok();
+    let mut names: Vec<(u32, String)> = std::fs::read_dir(&class)
+        .into_iter()
+        .flatten()
+        .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
+        .filter_map(|name| Some((number(&name)?, name)))
+        .collect();
+    names.sort_unstable();
+    names
+        .into_iter()
+        .map(|(_, name)| {
+            let usb = usb_folder(&class.join(&name).join("device"));
+            let attribute = |name| {
+                let text = std::fs::read_to_string(usb.as_ref()?.join(name)).ok()?;
+                Some(text.trim().to_owned()).filter(|text| !text.is_empty())
+            };
+            Node {
+                path: root.join("dev").join(&name),
+                serial: attribute("serial"),
+                usb_mbits: attribute("speed").and_then(|speed| speed.parse().ok()),
+                usb,
+            }
+        })
+        .collect()
+}
+
+/// The folder of the USB device that an interface belongs to.
+fn usb_folder(device: &Path) -> Option<PathBuf> {
+    let folder = device.canonicalize().ok()?;
+    folder.ancestors().find(|ancestor| ancestor.join("idVendor").exists()).map(Path::to_owned)
+}
+
+/// The links of udev that lead to a node: those by device before those by port.
+fn links_to(root: &Path, node: &Path) -> Vec<PathBuf> {
+    let Ok(node) = node.canonicalize() else { return Vec::new() };
+    let links_in = |folder: &str| {
+        let mut links: Vec<PathBuf> = std::fs::read_dir(root.join("dev/v4l").join(folder))
+            .into_iter()
+            .flatten()
+            .filter_map(|entry| Some(entry.ok()?.path()))
+            .filter(|link| link.canonicalize().is_ok_and(|meant| meant == node))
+            .collect();
+        links.sort_unstable();
+        links
+    };
+    ["by-id", "by-path"].into_iter().flat_map(links_in).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::os::unix::fs::symlink;
+
+    #[test]
+    fn stable_names_are_found_where_the_kernel_and_udev_put_them() {
+        let root = tempfile::tempdir().expect("a folder");
+        let root = root.path();
+        let usb = root.join("sys/devices/pci0/usb1/1-2");
+        let interface = usb.join("1-2:1.0");
+        for folder in [&interface, &root.join("sys/devices/platform/vivid.0"), &root.join("dev/v4l/by-id")] {
+            std::fs::create_dir_all(folder).expect("folder");
+        }
+        std::fs::create_dir_all(root.join("dev/v4l/by-path")).expect("folder");
+        for (name, text) in [("idVendor", "046d\n"), ("serial", "A1B2\n"), ("speed", "480\n")] {
+            std::fs::write(usb.join(name), text).expect("file");
+        }
+        for (node, device) in [("video10", &interface), ("video9", &root.join("sys/devices/platform/vivid.0"))] {
+            let folder = root.join("sys/class/video4linux").join(node);
+            std::fs::create_dir_all(&folder).expect("folder");
+            symlink(device, folder.join("device")).expect("link");
+            std::fs::write(root.join("dev").join(node), "").expect("file");
+        }
+        std::fs::create_dir_all(root.join("sys/class/video4linux/v4l-subdev0")).expect("folder");
+        let node = root.join("dev/video10");
+        symlink("../../video10", root.join("dev/v4l/by-path/pci-2")).expect("link");
+        symlink("../../video10", root.join("dev/v4l/by-id/usb-A1B2")).expect("link");
+        symlink("../../video9", root.join("dev/v4l/by-path/platform")).expect("link");
+        let found = nodes(root);
+        let wanted = [
+            Node { path: root.join("dev/video9"), usb: None, serial: None, usb_mbits: None },
+            Node {
+                path: node.clone(),
+                usb: Some(usb.canonicalize().expect("it is there")),
+                serial: Some("A1B2".into()),
+                usb_mbits: Some(480.0),
+            },
+        ];
+        assert_eq!(found, wanted);
+        assert_eq!(links_to(root, &node), [root.join("dev/v4l/by-id/usb-A1B2"), root.join("dev/v4l/by-path/pci-2")]);
+        let mut camera = Found {
+            node,
+            name: "C920".into(),
+            bus: "usb-1-2".into(),
+            serial: Some("A1B2".into()),
+            links: vec!["/dev/v4l/by-id/usb-A1B2".into()],
+            usb_mbits: None,
+            modes: Vec::new(),
+        };
+        assert_eq!(camera.address(), "/dev/v4l/by-id/usb-A1B2");
+        camera.links.clear();
+        assert_eq!(camera.address(), "A1B2");
+        camera.serial = None;
+        assert_eq!(camera.address(), "usb-1-2");
+    }
+
+    #[test]
+    fn nothing_plugged_in_is_nothing_found() {
+        let root = tempfile::tempdir().expect("a folder");
+        assert_eq!(nodes(root.path()), []);
+        let message = candidates("no such serial").expect_err("nothing of that name").to_string();
+        assert!(message.contains("no such serial") && message.contains("fieldrig devices"), "{message}");
+        assert_eq!(candidates("/dev/video99").expect("a path is a path"), [PathBuf::from("/dev/video99")]);
+    }
+}

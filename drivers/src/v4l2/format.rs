@@ -1,0 +1,387 @@
+//! Which pixel formats, sizes and rates V4L2 devices offer, and which of them is taken.
+//!
+//! Source of the codes and layouts: Linux `videodev2.h` and its documentation of image formats.
+
+use super::abi::{DISCRETE, Fraction, FrameInterval, FrameSize};
+use crate::{Error, PixelFormat, V4l2Colors, YuvColors, YuvLayout};
+
+/// Rates that differ by less than this share are the same: devices tell fractions of whole numbers.
+const SAME_RATE_FRAC: f64 = 0.01;
+
+/// The pixel formats that are read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum V4l2Format {
+    /// `YUYV`: two bytes a pixel.
+    Yuyv,
+    /// `UYVY`: two bytes a pixel.
+    Uyvy,
+    /// `NV12`: three bytes for two pixels.
+    Nv12,
+    /// `RGB3`: three bytes a pixel.
+    Rgb,
+    /// `BGR3`: three bytes a pixel.
+    Bgr,
+    /// `MJPG` or `JPEG`: compressed, far less than a byte a pixel.
+    Mjpeg,
+    /// `GREY`: one byte a pixel.
+    Grey,
+    /// `Z16`: depth, two bytes a pixel.
+    Z16,
+}
+
+impl V4l2Format {
+    /// Those of color with their names in rig files, in the order in which they are preferred: what is not compressed before
+    /// what is, colors before grey.
+    pub const OF_COLOR: [(&str, Self); 7] = [
+        ("yuyv", Self::Yuyv),
+        ("uyvy", Self::Uyvy),
+        ("nv12", Self::Nv12),
+        ("rgb", Self::Rgb),
+        ("bgr", Self::Bgr),
+        ("mjpeg", Self::Mjpeg),
+        ("grey", Self::Grey),
+    ];
+
+    /// Its name in rig files.
+    pub fn name(self) -> &'static str {
+        Self::OF_COLOR.iter().find(|(_, format)| *format == self).map_or("z16", |(name, _)| name)
+    }
+
+    /// Codes of the kernel; some devices call MJPEG by another.
+    const CODES: [(&[u8; 4], Self); 9] = [
+        (b"YUYV", Self::Yuyv),
+        (b"UYVY", Self::Uyvy),
+        (b"NV12", Self::Nv12),
+        (b"RGB3", Self::Rgb),
+        (b"BGR3", Self::Bgr),
+        (b"MJPG", Self::Mjpeg),
+        (b"JPEG", Self::Mjpeg),
+        (b"GREY", Self::Grey),
+        (b"Z16 ", Self::Z16),
+    ];
+
+    /// The format of a code.
+    pub(super) fn from_fourcc(fourcc: u32) -> Option<Self> {
+        Self::CODES.iter().find(|(code, _)| u32::from_le_bytes(**code) == fourcc).map(|(_, format)| *format)
+    }
+
+    /// The usual code of a format.
+    fn fourcc(self) -> u32 {
+        let usual = Self::CODES.iter().find(|(_, format)| *format == self);
+        usual.map_or(0, |(code, _)| u32::from_le_bytes(**code))
+    }
+
+    /// Bytes a second of images of a size at a rate; `None` where compression decides.
+    pub fn bytes_per_sec(self, [width, height]: [u32; 2], rate_hz: f64) -> Option<f64> {
+        let bytes_per_pixel = match self {
+            Self::Mjpeg => return None,
+            Self::Yuyv | Self::Uyvy | Self::Z16 => 2.0,
+            Self::Nv12 => 1.5,
+            Self::Rgb | Self::Bgr => 3.0,
+            Self::Grey => 1.0,
+        };
+        Some(bytes_per_pixel * f64::from(width) * f64::from(height) * rate_hz)
+    }
+
+    /// How its bytes are read; `metres_per_count` counts for depth only.
+    pub(super) fn pixels(self, colors: V4l2Colors, metres_per_count: f64) -> Result<PixelFormat, Error> {
+        let yuv = |layout| Ok(PixelFormat::Yuv { layout, colors: YuvColors::from_v4l2(colors)? });
+        match self {
+            Self::Yuyv => yuv(YuvLayout::Yuyv),
+            Self::Uyvy => yuv(YuvLayout::Uyvy),
+            Self::Nv12 => yuv(YuvLayout::Nv12),
+            Self::Rgb => Ok(PixelFormat::Rgb8),
+            Self::Bgr => Ok(PixelFormat::Bgr8),
+            Self::Mjpeg => Ok(PixelFormat::Jpeg),
+            Self::Grey => Ok(PixelFormat::Gray8),
+            Self::Z16 => Ok(PixelFormat::DepthU16 { metres_per_count }),
+        }
+    }
+}
+
+/// One thing that a device offers: a format at a size, with its rates.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Mode {
+    /// Its code, which the device is asked with.
+    pub(super) fourcc: u32,
+    /// The format.
+    pub format: V4l2Format,
+    /// The sizes.
+    pub sizes: Sizes,
+    /// Images a second at these sizes (at the largest, where there are several).
+    pub rates: Rates,
+}
+
+/// Sizes of images, pixels.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Sizes {
+    /// One.
+    One([u32; 2]),
+    /// Any from the least to the most, in steps, by width and height.
+    Range {
+        /// Least.
+        least: [u32; 2],
+        /// Most.
+        most: [u32; 2],
+        /// Steps.
+        step: [u32; 2],
+    },
+}
+
+/// Images a second.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Rates {
+    /// The device does not tell.
+    Untold,
+    /// One of these.
+    List(Vec<f64>),
+    /// Any in this range.
+    Range {
+        /// Slowest.
+        least_hz: f64,
+        /// Fastest.
+        most_hz: f64,
+    },
+}
+
+impl Mode {
+    /// A format at one size with the rates of a list.
+    pub fn new(format: V4l2Format, size_px: [u32; 2], rates_hz: &[f64]) -> Self {
+        Self { fourcc: format.fourcc(), format, sizes: Sizes::One(size_px), rates: Rates::List(rates_hz.to_vec()) }
+    }
+}
+
+impl Sizes {
+    pub(super) fn from_kernel(told: &FrameSize) -> Self {
+        let [a, b, c, d, e, f] = told.numbers;
+        match told.kind {
+            DISCRETE => Self::One([a, b]),
+            _ => Self::Range { least: [a, d], most: [b, e], step: [c, f] },
+        }
+    }
+
+    /// The largest.
+    pub(super) fn most(&self) -> [u32; 2] {
+        match self {
+            Self::One(size) => *size,
+            Self::Range { most, .. } => *most,
+        }
+    }
+
+    fn has(&self, wanted: [u32; 2]) -> bool {
+        match self {
+            Self::One(size) => *size == wanted,
+            Self::Range { least, most, step } => (0..2).all(|side| {
+                let (wanted, least, most) = (wanted[side], least[side], most[side]);
+                (least..=most).contains(&wanted) && (wanted - least).is_multiple_of(step[side].max(1))
+            }),
+        }
+    }
+}
+
+impl Rates {
+    pub(super) fn from_kernel(told: &[FrameInterval]) -> Self {
+        match told.first() {
+            None => Self::Untold,
+            Some(first) if first.kind == DISCRETE => {
+                Self::List(told.iter().map(|interval| rate_of(interval.fractions[0])).collect())
+            }
+            // The longest interval is the lowest rate.
+            Some(range) => Self::Range { least_hz: rate_of(range.fractions[1]), most_hz: rate_of(range.fractions[0]) },
+        }
+    }
+
+    fn has(&self, wanted_hz: f64) -> bool {
+        match self {
+            Self::Untold => true,
+            Self::List(rates) => rates.iter().any(|rate_hz| is_same_rate(*rate_hz, wanted_hz)),
+            Self::Range { least_hz, most_hz } => {
+                (least_hz * (1.0 - SAME_RATE_FRAC)..=most_hz * (1.0 + SAME_RATE_FRAC)).contains(&wanted_hz)
+            }
+        }
+    }
+}
+
+/// The mode to take: of a format, if one is asked for, else the first in the order of [`V4l2Format::OF_COLOR`].
+pub(super) fn choose(modes: &[Mode], format: Option<V4l2Format>, size_px: [u32; 2], rate_hz: f64) -> Option<&Mode> {
+    let fits = |mode: &&Mode| mode.sizes.has(size_px) && mode.rates.has(rate_hz);
+    let of = |format: V4l2Format| modes.iter().filter(move |mode| mode.format == format).find(fits);
+    match format {
+        Some(format) => of(format),
+        None => V4l2Format::OF_COLOR.iter().find_map(|(_, each)| of(*each)),
+    }
+}
+
+/// Place of a format in the order in which they are preferred; depth, which is asked for by name, comes last.
+pub(super) fn rank(format: V4l2Format) -> usize {
+    V4l2Format::OF_COLOR.iter().position(|(_, each)| *each == format).unwrap_or(V4l2Format::OF_COLOR.len())
+}
+
+/// Bytes a second that USB carries to one camera, by the speed that sysfs tells: the largest isochronous transfer of an endpoint.
+///
+/// Source: USB 2.0 section 5.6.3 (full speed 1023 bytes a millisecond, high speed 3072 bytes in 125 us), USB 3.2 section 8.12.6
+/// (48 KiB in 125 us; twice that at 10 Gbit/s).
+pub(super) fn usb_bytes_per_sec(mbits: f64) -> f64 {
+    match mbits {
+        mbits if mbits < 480.0 => 1023.0 * 1e3,
+        mbits if mbits < 5000.0 => 3072.0 * 8e3,
+        mbits if mbits < 10_000.0 => 49_152.0 * 8e3,
+        _ => 98_304.0 * 8e3,
+    }
+}
+
+/// What of some modes takes more than so many bytes a second: the slowest rate of each that does, for people.
+pub(super) fn beyond(modes: &[Mode], bytes_per_sec: f64) -> Vec<String> {
+    let too_fast = |mode: &Mode| {
+        let [width, height] = mode.sizes.most();
+        let needs = |rate_hz: f64| mode.format.bytes_per_sec([width, height], rate_hz);
+        let rates: &[f64] = match &mode.rates {
+            Rates::Untold => &[],
+            Rates::List(rates) => rates,
+            Rates::Range { most_hz, .. } => std::slice::from_ref(most_hz),
+        };
+        let slowest = rates.iter().copied().filter(|hz| needs(*hz) > Some(bytes_per_sec)).fold(f64::INFINITY, f64::min);
+        let megabytes = needs(slowest).filter(|needs| needs.is_finite())? * 1e-6;
+        Some(format!("{} {width}x{height} at {slowest:.0} Hz ({megabytes:.0} MB/s)", mode.format.name()))
+    };
+    modes.iter().filter_map(too_fast).collect()
+}
+
+/// Whether two rates, images a second, are one rate told in two ways.
+pub(super) fn is_same_rate(one_hz: f64, other_hz: f64) -> bool {
+    (one_hz - other_hz).abs() <= SAME_RATE_FRAC * other_hz
+}
+
+/// Images a second of the time between two.
+pub(super) fn rate_of(interval: Fraction) -> f64 {
+    f64::from(interval.denominator) / f64::from(interval.numerator.max(1))
+}
+
+/// Time between two images of a rate, in the kernel's fractions: exact for whole rates, to a millionth for others.
+pub(super) fn interval_of(rate_hz: f64) -> Fraction {
+    const PARTS: f64 = 1e6;
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a rig's rates are 0.01 to 1000")]
+    let whole = |number: f64| number.round() as u32;
+    match rate_hz.fract() == 0.0 {
+        true => Fraction { numerator: 1, denominator: whole(rate_hz) },
+        false => Fraction { numerator: whole(PARTS), denominator: whole(PARTS * rate_hz) },
+    }
+}
+
+/// What some modes offer, for people: each format with its sizes and the highest rate at each.
+pub fn summary(modes: &[Mode]) -> String {
+    let size = |mode: &Mode| {
+        let sizes = match &mode.sizes {
+            Sizes::One([width, height]) => format!("{width}x{height}"),
+            Sizes::Range { least: [w0, h0], most: [w1, h1], .. } => format!("{w0}x{h0} to {w1}x{h1}"),
+        };
+        let most_hz = match &mode.rates {
+            Rates::Untold => return sizes,
+            Rates::List(rates) => rates.iter().copied().fold(0.0, f64::max),
+            Rates::Range { most_hz, .. } => *most_hz,
+        };
+        format!("{sizes} up to {} Hz", (most_hz * 100.0).round() / 100.0)
+    };
+    let of_format = |format: V4l2Format| {
+        let sizes: Vec<_> = modes.iter().filter(|mode| mode.format == format).map(size).collect();
+        (!sizes.is_empty()).then(|| format!("{}: {}", format.name(), sizes.join(", ")))
+    };
+    let formats = V4l2Format::OF_COLOR.iter().map(|(_, format)| *format).chain([V4l2Format::Z16]);
+    let all: Vec<_> = formats.filter_map(of_format).collect();
+    if all.is_empty() { "no format that is read here".to_owned() } else { all.join("; ") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_not_compressed_is_taken_where_it_is_fast_enough() {
+        use V4l2Format::{Grey, Mjpeg, Yuyv, Z16};
+        // As a USB 2 webcam offers them.
+        let modes = [
+            Mode::new(Mjpeg, [1280, 720], &[30.0, 15.0]),
+            Mode::new(Yuyv, [640, 480], &[30.0]),
+            Mode::new(Yuyv, [1280, 720], &[10.0]),
+            Mode::new(Z16, [848, 480], &[30.0]),
+            Mode::new(Grey, [848, 480], &[30.0]),
+        ];
+        let taken = |format, size, rate_hz| choose(&modes, format, size, rate_hz).map(|mode| mode.format);
+        assert_eq!(taken(None, [640, 480], 30.0), Some(Yuyv));
+        assert_eq!(taken(None, [1280, 720], 30.0), Some(Mjpeg));
+        assert_eq!(taken(None, [1280, 720], 10.0), Some(Yuyv));
+        assert_eq!(taken(None, [640, 480], 29.97), Some(Yuyv));
+        assert_eq!(taken(None, [640, 480], 25.0), None);
+        assert_eq!(taken(Some(Yuyv), [1280, 720], 30.0), None);
+        assert_eq!(taken(Some(Z16), [848, 480], 30.0), Some(Z16));
+        assert_eq!(taken(None, [848, 480], 30.0), Some(Grey), "depth is never taken for color");
+    }
+
+    #[test]
+    fn ranges_hold_their_steps() {
+        let sizes = Sizes::Range { least: [16, 16], most: [1920, 1080], step: [8, 2] };
+        assert!(sizes.has([640, 480]) && sizes.has([16, 16]) && sizes.has([1920, 1080]));
+        assert!(!sizes.has([644, 480]) && !sizes.has([640, 481]) && !sizes.has([8, 16]) && !sizes.has([1928, 1080]));
+        let range = FrameInterval {
+            kind: 3,
+            fractions: [
+                Fraction { numerator: 1, denominator: 60 },
+                Fraction { numerator: 1, denominator: 5 },
+                Fraction { numerator: 1, denominator: 60 },
+            ],
+            ..Default::default()
+        };
+        let rates = Rates::from_kernel(&[range]);
+        assert_eq!(rates, Rates::Range { least_hz: 5.0, most_hz: 60.0 });
+        assert!(rates.has(30.0) && rates.has(60.0) && !rates.has(61.0) && !rates.has(4.9));
+        assert_eq!(Rates::from_kernel(&[]), Rates::Untold);
+    }
+
+    #[test]
+    fn rates_survive_the_kernels_fractions() {
+        for rate_hz in [0.01, 0.5, 7.5, 14.985, 29.97, 30.0, 60.0, 90.0, 1000.0] {
+            let back_hz = rate_of(interval_of(rate_hz));
+            assert!((back_hz - rate_hz).abs() <= 1e-6 * rate_hz.max(1.0), "{rate_hz}: {back_hz}");
+        }
+        assert!(is_same_rate(rate_of(Fraction { numerator: 333_667, denominator: 10_000_000 }), 30.0));
+        assert!(rate_of(Fraction::default()).is_finite());
+    }
+
+    #[test]
+    fn bandwidth_of_the_issue() {
+        let bytes = V4l2Format::Yuyv.bytes_per_sec([2560, 1440], 30.0).expect("not compressed");
+        assert_eq!((bytes / 1e6).round(), 221.0);
+        assert_eq!(V4l2Format::Mjpeg.bytes_per_sec([2560, 1440], 30.0), None);
+        let modes = [
+            Mode::new(V4l2Format::Yuyv, [640, 480], &[30.0, 15.0]),
+            Mode::new(V4l2Format::Yuyv, [2560, 1440], &[5.0, 30.0, 15.0]),
+            Mode::new(V4l2Format::Mjpeg, [2560, 1440], &[30.0]),
+        ];
+        assert_eq!(beyond(&modes, usb_bytes_per_sec(480.0)), ["yuyv 2560x1440 at 5 Hz (37 MB/s)"]);
+        assert_eq!(beyond(&modes, usb_bytes_per_sec(5000.0)), Vec::<String>::new());
+        assert_eq!(beyond(&modes, 200e6), ["yuyv 2560x1440 at 30 Hz (221 MB/s)"]);
+    }
+
+    #[test]
+    fn codes_are_the_kernels() {
+        // v4l2_fourcc(a, b, c, d) is a | b << 8 | c << 16 | d << 24.
+        assert_eq!(V4l2Format::from_fourcc(0x5659_5559), Some(V4l2Format::Yuyv));
+        assert_eq!(V4l2Format::from_fourcc(0x2036_315a), Some(V4l2Format::Z16));
+        assert_eq!(V4l2Format::from_fourcc(0), None);
+        for (_, format) in V4l2Format::OF_COLOR {
+            assert_eq!(V4l2Format::from_fourcc(format.fourcc()), Some(format));
+        }
+    }
+
+    #[test]
+    fn offers_are_told_by_format() {
+        let modes = [
+            Mode::new(V4l2Format::Mjpeg, [1280, 720], &[30.0, 15.0]),
+            Mode::new(V4l2Format::Yuyv, [640, 480], &[14.985, 29.97]),
+            Mode::new(V4l2Format::Yuyv, [1280, 720], &[10.0]),
+        ];
+        let told = "yuyv: 640x480 up to 29.97 Hz, 1280x720 up to 10 Hz; mjpeg: 1280x720 up to 30 Hz";
+        assert_eq!(summary(&modes), told);
+        assert_eq!(summary(&[]), "no format that is read here");
+    }
+}

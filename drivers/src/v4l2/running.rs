@@ -1,0 +1,303 @@
+//! A V4L2 device that streams: from the node to stamped images.
+
+use super::abi::{FIELD_ANY, FIELD_NONE, PixFormat};
+use super::controls::{self, Applied};
+use super::device::{Device, Filled, Refused, Stream};
+use super::format::{self, Mode, V4l2Format};
+use super::sequence::Sequence;
+use super::{Config, Delivery, Problem, find};
+use crate::{Error, Image, PixelFormat, V4l2Colors, clock};
+use kinematics::Stamp;
+use rustix::io::Errno;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// Images that the device may fill while we copy one: a quarter of a second at 30 Hz.
+const N_BUFFERS: u32 = 8;
+/// A stamp so long before the stream began, or after now, is of another clock, whatever its flag says.
+const MAX_STAMP_OFF_SECS: f64 = 1.0;
+/// Asking for the exposure of each image may take this share of the time between two.
+const MAX_ASKING_FRAC: f64 = 0.25;
+
+/// A device that streams.
+#[derive(Debug)]
+pub(super) struct Running {
+    stream: Stream,
+    camera: Arc<str>,
+    path: PathBuf,
+    mode: String,
+    format: PixelFormat,
+    bytes_per_line: usize,
+    applied: Applied,
+    sequence: Sequence,
+    began: Stamp,
+    /// Lost and not told yet.
+    n_untold: u64,
+    n_images: u64,
+    n_damaged: u64,
+    last_whole: Instant,
+    clock_warned: bool,
+}
+
+impl Running {
+    /// Finds the device of a config and starts it.
+    pub(super) fn start(config: &Config) -> Result<Self, Error> {
+        let named = |problem| Error::V4l2 { camera: config.name.clone(), problem: Box::new(problem) };
+        let candidates = find::candidates(&config.device).map_err(named)?;
+        // A depth camera has nodes for color, infrared and depth under one serial number: the best that fits is meant.
+        let rank = |path: &&PathBuf| {
+            let modes = open(config, path).map(|device| find::modes(&device)).unwrap_or_default();
+            let mode = format::choose(&modes, config.format, config.intrinsics.size_px, config.rate_hz);
+            mode.map_or(usize::MAX, |mode| format::rank(mode.format))
+        };
+        match candidates.iter().min_by_key(rank) {
+            Some(path) => Self::start_node(config, path),
+            None => Err(named(Problem::NoDevice { device: config.device.clone() })),
+        }
+    }
+
+    fn start_node(config: &Config, path: &Path) -> Result<Self, Error> {
+        let named = |problem| Error::V4l2 { camera: config.name.clone(), problem: Box::new(problem) };
+        let device = open(config, path).map_err(named)?;
+        let (mode, pix) = set_mode(config, path, &device).map_err(named)?;
+        let colors = V4l2Colors {
+            colorspace: pix.colorspace,
+            ycbcr_enc: pix.ycbcr_enc,
+            quantization: pix.quantization,
+            is_hdtv: device.is_hdtv(),
+        };
+        if mode.format == V4l2Format::Z16 && config.metres_per_count.is_none() {
+            return Err(named(Problem::NoDepthScale));
+        }
+        let format = mode.format.pixels(colors, config.metres_per_count.unwrap_or(0.0))?;
+        controls::apply(&config.settings, &device).map_err(named)?;
+        let wanted = wanted(config, Some(mode.format));
+        let began = clock::now();
+        let stream = device.stream(N_BUFFERS).map_err(|refused| {
+            let bytes_per_sec = mode.format.bytes_per_sec(config.intrinsics.size_px, config.rate_hz);
+            named(problem_of(refused, path, wanted.clone(), bytes_per_sec))
+        })?;
+        let applied = controls::confirm(&config.settings, stream.device()).map_err(named)?;
+        Ok(Self {
+            stream,
+            camera: config.name.as_str().into(),
+            path: path.to_owned(),
+            mode: wanted,
+            format,
+            bytes_per_line: pix.bytes_per_line as usize,
+            applied,
+            sequence: Sequence::default(),
+            began,
+            n_untold: 0,
+            n_images: 0,
+            n_damaged: 0,
+            last_whole: Instant::now(),
+            clock_warned: false,
+        })
+    }
+
+    /// Node, mode and settings, for people.
+    pub(super) fn describe(&self) -> String {
+        let settings: Vec<_> = self.applied.read_back.iter().map(|(name, value)| format!("{name} {value}")).collect();
+        format!("{}, {}; read back: {}", self.path.display(), self.mode, settings.join(", "))
+    }
+
+    pub(super) fn read_back(&self) -> &[(&'static str, i32)] {
+        &self.applied.read_back
+    }
+
+    /// Images given out since the start.
+    pub(super) fn n_images(&self) -> u64 {
+        self.n_images
+    }
+
+    /// Images since the start that came damaged; they are among the skipped ones.
+    pub(super) fn n_damaged(&self) -> u64 {
+        self.n_damaged
+    }
+
+    /// Since when no whole image came.
+    pub(super) fn silent_for(&self) -> Duration {
+        self.last_whole.elapsed()
+    }
+
+    /// The next image, or `None` when none came until the deadline; an error means that the device is lost.
+    pub(super) fn next_image(&mut self, config: &Config, deadline: Instant) -> Result<Option<Image>, Problem> {
+        loop {
+            let Some(filled) = self.next_filled(config.delivery, deadline)? else { return Ok(None) };
+            self.n_untold += self.sequence.n_skipped_before(filled.sequence);
+            let image = (!filled.is_damaged).then(|| self.image_of(&filled, config.intrinsics.size_px));
+            self.stream.give_back(filled).map_err(lost)?;
+            match image {
+                Some(Ok(mut image)) => {
+                    image.exposure_secs = self.exposure_secs(config.rate_hz);
+                    image.n_skipped = std::mem::take(&mut self.n_untold);
+                    self.n_images += 1;
+                    self.last_whole = Instant::now();
+                    return Ok(Some(image));
+                }
+                damaged => {
+                    if let Some(Err(error)) = damaged {
+                        log::debug!("{error}");
+                    }
+                    self.n_untold += 1;
+                    self.n_damaged += 1;
+                    if Instant::now() >= deadline {
+                        return Ok(None);
+                    }
+                }
+            }
+        }
+    }
+
+    /// The image to hand out: the oldest that waits, or the newest, which gives the older ones back.
+    fn next_filled(&mut self, delivery: Delivery, deadline: Instant) -> Result<Option<Filled>, Problem> {
+        let mut taken: Option<Filled> = None;
+        loop {
+            match self.stream.take().map_err(lost)? {
+                Some(newer) => {
+                    if let Some(older) = taken.replace(newer) {
+                        self.n_untold += self.sequence.n_skipped_before(older.sequence) + 1;
+                        self.stream.give_back(older).map_err(lost)?;
+                    }
+                    if delivery == Delivery::Every {
+                        return Ok(taken);
+                    }
+                }
+                None if taken.is_some() => return Ok(taken),
+                None => {
+                    let timeout = deadline.saturating_duration_since(Instant::now());
+                    if !self.stream.wait(timeout).map_err(lost)? && Instant::now() >= deadline {
+                        return Ok(None);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Copies an image out of the shared memory, without the padding of its rows.
+    fn image_of(&mut self, filled: &Filled, size_px: [u32; 2]) -> Result<Image, Error> {
+        let stamp = self.stamp_of(filled);
+        Image {
+            camera: Arc::clone(&self.camera),
+            stamp,
+            size_px,
+            format: self.format,
+            data: self.stream.bytes(filled).into(),
+            exposure_secs: None,
+            n_skipped: 0,
+        }
+        .pack_rows(self.bytes_per_line)
+    }
+
+    /// The device's stamp where it is of our clock, else now. `stamp_to_mid_exposure_millis` of the rig file says what it means.
+    fn stamp_of(&mut self, filled: &Filled) -> Stamp {
+        let now = clock::now();
+        let stamp = Stamp(filled.stamp_nanos);
+        let ours = self.began.plus_secs(-MAX_STAMP_OFF_SECS)..now.plus_secs(MAX_STAMP_OFF_SECS);
+        if filled.is_monotonic && ours.contains(&stamp) {
+            return stamp;
+        }
+        if !std::mem::replace(&mut self.clock_warned, true) {
+            log::warn!(
+                "camera {:?}: its stamps are not of the monotonic clock; images are stamped as they arrive",
+                self.camera
+            );
+        }
+        now
+    }
+
+    /// Fixed, or what the camera tells now; not asked for again once asking fails or takes too long.
+    fn exposure_secs(&mut self, rate_hz: f64) -> Option<f64> {
+        if !self.applied.tells_exposure {
+            return self.applied.exposure_secs;
+        }
+        let began = Instant::now();
+        let exposure_secs = controls::exposure_secs(self.stream.device());
+        let took = began.elapsed();
+        if exposure_secs.is_none() || took.as_secs_f64() * rate_hz > MAX_ASKING_FRAC {
+            log::warn!("camera {:?}: asking for its exposure took {took:?}; it is not told any more", self.camera);
+            self.applied.tells_exposure = false;
+        }
+        exposure_secs
+    }
+}
+
+/// Why a stream did not begin; `ENOSPC` is how the kernel says that USB has no bandwidth left (`usb_submit_urb`).
+fn problem_of(refused: Refused, path: &Path, mode: String, bytes_per_sec: Option<f64>) -> Problem {
+    match refused {
+        Refused::Begin(Errno::NOSPC) => Problem::Bandwidth { mode, bytes_per_sec },
+        Refused::Buffers(Errno::BUSY) | Refused::Begin(Errno::BUSY) => Problem::Busy { path: path.to_owned() },
+        Refused::Buffers(error) => Problem::Refused { what: "share memory for images", source: error.into() },
+        Refused::Begin(error) => Problem::Refused { what: "begin its stream", source: error.into() },
+    }
+}
+
+/// A device that streamed and fails is unplugged, or as good as that.
+fn lost(error: Errno) -> Problem {
+    Problem::Unplugged { source: error.into() }
+}
+
+fn open(config: &Config, path: &Path) -> Result<Device, Problem> {
+    let device = Device::open(path).map_err(|error| match error {
+        Errno::NOENT | Errno::NXIO | Errno::NODEV => Problem::NoDevice { device: config.device.clone() },
+        Errno::BUSY => Problem::Busy { path: path.to_owned() },
+        error => Problem::Open { path: path.to_owned(), source: error.into() },
+    })?;
+    match device.identity() {
+        Ok(identity) if identity.streams_images => Ok(device),
+        _ => Err(Problem::NotACamera { path: path.to_owned() }),
+    }
+}
+
+/// Chooses the mode and sets it; the device must do exactly that.
+fn set_mode(config: &Config, path: &Path, device: &Device) -> Result<(Mode, PixFormat), Problem> {
+    let modes = find::modes(device);
+    let (size_px, rate_hz) = (config.intrinsics.size_px, config.rate_hz);
+    let mode = format::choose(&modes, config.format, size_px, rate_hz)
+        .ok_or_else(|| Problem::NoMode { wanted: wanted(config, config.format), offered: format::summary(&modes) })?;
+    let refused = |error| match error {
+        Errno::BUSY => Problem::Busy { path: path.to_owned() },
+        error => Problem::Refused { what: "take the format", source: std::io::Error::from(error) },
+    };
+    let pix = device.set_format(mode.fourcc, size_px).map_err(refused)?;
+    let got_hz = device.set_rate_hz(rate_hz).map_err(refused)?;
+    let is_same = pix.fourcc == mode.fourcc && [pix.width, pix.height] == size_px;
+    if !is_same || got_hz.is_some_and(|got_hz| !format::is_same_rate(got_hz, rate_hz)) {
+        let format = V4l2Format::from_fourcc(pix.fourcc).map_or("another format", V4l2Format::name);
+        let rate = got_hz.map_or(String::new(), |got_hz| format!(" at {got_hz:.2} Hz"));
+        let got = format!("{format} {}x{}{rate}", pix.width, pix.height);
+        return Err(Problem::OtherMode { wanted: wanted(config, Some(mode.format)), got });
+    }
+    if ![FIELD_ANY, FIELD_NONE].contains(&pix.field) {
+        log::warn!("camera {:?}: it sends every other row at another time (interlaced)", config.name);
+    }
+    if got_hz.is_none() {
+        log::warn!("camera {:?}: its rate cannot be set; rate_hz of the rig file is taken for it", config.name);
+    }
+    Ok((mode.clone(), pix))
+}
+
+fn wanted(config: &Config, format: Option<V4l2Format>) -> String {
+    let [width, height] = config.intrinsics.size_px;
+    format!("{} {width}x{height} at {} Hz", format.map_or("color", V4l2Format::name), config.rate_hz)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stream_without_bandwidth_is_told_with_what_to_do() {
+        let told =
+            |refused, mode: &str, bytes| problem_of(refused, Path::new("/dev/video0"), mode.into(), bytes).to_string();
+        let full = told(Refused::Begin(Errno::NOSPC), "yuyv 2560x1440 at 30 Hz", Some(221.2e6));
+        assert!(full.starts_with("USB has no bandwidth left for yuyv 2560x1440 at 30 Hz (221 MB/s): "), "{full}");
+        assert!(full.contains("mjpeg") && full.contains("another USB controller"), "{full}");
+        let compressed = told(Refused::Begin(Errno::NOSPC), "mjpeg 2560x1440 at 30 Hz", None);
+        assert!(compressed.starts_with("USB has no bandwidth left for mjpeg 2560x1440 at 30 Hz: "), "{compressed}");
+        assert!(told(Refused::Buffers(Errno::BUSY), "", None).contains("fuser -v /dev/video0"));
+        assert!(told(Refused::Begin(Errno::IO), "", None).starts_with("it refuses to begin its stream: "));
+    }
+}

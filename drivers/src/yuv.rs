@@ -1,0 +1,340 @@
+//! Luma and colour differences, as cameras send them, to red, green and blue.
+//!
+//! Source: ITU-R BT.601-7 and BT.709-6 (matrices, limited range), Linux `videodev2.h` (defaults, layouts). Transfer functions
+//! are taken to be sRGB's: cameras rarely mean what they announce, and the difference is that of a tone curve.
+
+use crate::Error;
+
+/// How luma (Y) and colour differences (U is blue, V is red) lie in the bytes; 8 bits each.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum YuvLayout {
+    /// `Y0 U Y1 V` for each two pixels of a row.
+    Yuyv,
+    /// `U Y0 V Y1` for each two pixels of a row.
+    Uyvy,
+    /// All Y, a row as long as an even width; then for each two rows one row of `U V` for each two pixels.
+    Nv12,
+}
+
+/// Share of red and blue in the luma.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum YuvMatrix {
+    /// Standard definition and webcams.
+    Bt601,
+    /// High definition.
+    Bt709,
+}
+
+/// Which counts black and white have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum YuvRange {
+    /// Luma 16 to 235, differences 16 to 240.
+    Limited,
+    /// 0 to 255.
+    Full,
+}
+
+/// What the counts of a YUV image mean.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct YuvColors {
+    /// Matrix between luma with differences and red, green, blue.
+    pub matrix: YuvMatrix,
+    /// Range of the counts.
+    pub range: YuvRange,
+}
+
+/// What a V4L2 device says of its colours (`struct v4l2_pix_format`), numbers of `videodev2.h`; 0 stands for a default.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct V4l2Colors {
+    /// `enum v4l2_colorspace`.
+    pub colorspace: u32,
+    /// `enum v4l2_ycbcr_encoding`.
+    pub ycbcr_enc: u32,
+    /// `enum v4l2_quantization`.
+    pub quantization: u32,
+    /// The device receives a high-definition television signal (it has DV timings), as HDMI grabbers do; cameras do not.
+    pub is_hdtv: bool,
+}
+
+impl YuvColors {
+    /// Settles what a V4L2 device leaves open as `V4L2_MAP_COLORSPACE_DEFAULT`, `V4L2_MAP_YCBCR_ENC_DEFAULT` and
+    /// `V4L2_MAP_QUANTIZATION_DEFAULT` do; fails for BT.2020 and SMPTE 240M.
+    pub fn from_v4l2(told: V4l2Colors) -> Result<Self, Error> {
+        const REC709: u32 = 3;
+        const JPEG: u32 = 7;
+        const SRGB: u32 = 8;
+        const DCI_P3: u32 = 12;
+        let colorspace = match (told.colorspace, told.is_hdtv) {
+            (0, true) => REC709,
+            (0, false) => SRGB, // Standard definition (SMPTE 170M) has the same matrix and range.
+            (colorspace, _) => colorspace,
+        };
+        let matrix = match (told.ycbcr_enc, colorspace) {
+            // 601, xvYCC 601, sYCC; 709, xvYCC 709.
+            (1 | 3 | 5, _) => YuvMatrix::Bt601,
+            (2 | 4, _) | (0, REC709 | DCI_P3) => YuvMatrix::Bt709,
+            (0, 1 | 4..=9 | 11) => YuvMatrix::Bt601,
+            _ => return Err(Error::YuvColors { colorspace, ycbcr_enc: told.ycbcr_enc }),
+        };
+        let range = match (told.quantization, colorspace) {
+            (1, _) | (0, JPEG) => YuvRange::Full,
+            _ => YuvRange::Limited,
+        };
+        Ok(Self { matrix, range })
+    }
+
+    /// Weights of red and blue in the luma.
+    fn luma_weights(self) -> [f64; 2] {
+        match self.matrix {
+            YuvMatrix::Bt601 => [0.299, 0.114],
+            YuvMatrix::Bt709 => [0.2126, 0.0722],
+        }
+    }
+
+    /// Luma of black, and counts of red, green, blue per count: `[y, v in red, u in green, v in green, u in blue]`.
+    fn coefficients(self) -> (f64, [f64; 5]) {
+        let [red, blue] = self.luma_weights();
+        let green = 1.0 - red - blue;
+        let (black, luma, difference) = match self.range {
+            YuvRange::Limited => (16.0, 255.0 / 219.0, 255.0 / 224.0),
+            YuvRange::Full => (0.0, 1.0, 1.0),
+        };
+        let v_in_red = 2.0 * (1.0 - red) * difference;
+        let u_in_blue = 2.0 * (1.0 - blue) * difference;
+        (black, [luma, v_in_red, -u_in_blue * blue / green, -v_in_red * red / green, u_in_blue])
+    }
+}
+
+impl YuvLayout {
+    /// Bytes of a row without padding; the last pixel of an odd width has a pair of its own.
+    pub(crate) fn row_bytes(self, width: usize) -> usize {
+        match self {
+            Self::Yuyv | Self::Uyvy => width.div_ceil(2).saturating_mul(4),
+            Self::Nv12 => width.div_ceil(2).saturating_mul(2),
+        }
+    }
+
+    /// Rows of that length.
+    pub(crate) fn n_rows(self, height: usize) -> usize {
+        match self {
+            Self::Yuyv | Self::Uyvy => height,
+            Self::Nv12 => height.saturating_add(height.div_ceil(2)),
+        }
+    }
+}
+
+/// Red, green and blue, `[height, width, 3]`, of an image without padding; `data` is as long as its layout says.
+pub(crate) fn rgb(layout: YuvLayout, colors: YuvColors, size_px: [u32; 2], data: &[u8]) -> Vec<u8> {
+    let [width, height] = size_px.map(|side| side as usize);
+    let mut rgb = vec![0; width * height * 3];
+    if rgb.is_empty() {
+        return rgb;
+    }
+    let fixed = Fixed::new(colors);
+    let row_bytes = layout.row_bytes(width);
+    let (rows, chroma) = data.split_at(row_bytes * height);
+    for (row_ix, (out, row)) in rgb.chunks_exact_mut(width * 3).zip(rows.chunks_exact(row_bytes)).enumerate() {
+        match layout {
+            YuvLayout::Yuyv => fixed.row(out, row.as_chunks::<4>().0.iter().map(|&[y0, u, y1, v]| [y0, y1, u, v])),
+            YuvLayout::Uyvy => fixed.row(out, row.as_chunks::<4>().0.iter().map(|&[u, y0, v, y1]| [y0, y1, u, v])),
+            YuvLayout::Nv12 => {
+                let differences = chroma[row_ix / 2 * row_bytes..][..row_bytes].as_chunks::<2>().0;
+                let lumas = row.as_chunks::<2>().0.iter();
+                fixed.row(out, lumas.zip(differences).map(|(&[y0, y1], &[u, v])| [y0, y1, u, v]));
+            }
+        }
+    }
+    rgb
+}
+
+/// The coefficients of [`YuvColors`] times `1 << SHIFT`: products and sums fit 32 bits, and are off by less than 0.04 of a count.
+#[derive(Clone, Copy)]
+struct Fixed {
+    black: i32,
+    luma: i32,
+    v_in_red: i32,
+    u_in_green: i32,
+    v_in_green: i32,
+    u_in_blue: i32,
+}
+
+const SHIFT: u32 = 13;
+
+impl Fixed {
+    fn new(colors: YuvColors) -> Self {
+        let (black, coefficients) = colors.coefficients();
+        #[expect(clippy::cast_possible_truncation, reason = "coefficients are below 3, black is 0 or 16")]
+        let whole = |number: f64| number.round() as i32;
+        let [luma, v_in_red, u_in_green, v_in_green, u_in_blue] =
+            coefficients.map(|coefficient| whole(coefficient * f64::from(1 << SHIFT)));
+        Self { black: whole(black), luma, v_in_red, u_in_green, v_in_green, u_in_blue }
+    }
+
+    /// One row from its pairs `[y0, y1, u, v]`; of the last pair an odd width takes the first pixel.
+    #[inline(always)]
+    fn row(self, out: &mut [u8], mut pairs: impl Iterator<Item = [u8; 4]>) {
+        let (whole, rest) = out.as_chunks_mut::<6>();
+        for (out, pair) in whole.iter_mut().zip(&mut pairs) {
+            *out = self.pair(pair);
+        }
+        if let (false, Some(pair)) = (rest.is_empty(), pairs.next()) {
+            rest.copy_from_slice(&self.pair(pair)[..3]);
+        }
+    }
+
+    #[inline(always)]
+    fn pair(self, [y0, y1, u, v]: [u8; 4]) -> [u8; 6] {
+        const HALF: i32 = 1 << (SHIFT - 1);
+        let (u, v) = (i32::from(u) - 128, i32::from(v) - 128);
+        let red = v * self.v_in_red + HALF;
+        let green = u * self.u_in_green + v * self.v_in_green + HALF;
+        let blue = u * self.u_in_blue + HALF;
+        let [y0, y1] = [y0, y1].map(|y| (i32::from(y) - self.black) * self.luma);
+        [y0 + red, y0 + green, y0 + blue, y1 + red, y1 + green, y1 + blue].map(to_byte)
+    }
+}
+
+#[inline(always)]
+fn to_byte(scaled: i32) -> u8 {
+    (scaled >> SHIFT).clamp(0, 255) as u8
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LAYOUTS: [YuvLayout; 3] = [YuvLayout::Yuyv, YuvLayout::Uyvy, YuvLayout::Nv12];
+
+    fn all_colors() -> impl Iterator<Item = YuvColors> {
+        [YuvMatrix::Bt601, YuvMatrix::Bt709].into_iter().flat_map(|matrix| {
+            [YuvRange::Limited, YuvRange::Full].into_iter().map(move |range| YuvColors { matrix, range })
+        })
+    }
+
+    /// The twin in f64, written from the standards' own direction: differences are scaled `blue - luma` and `red - luma`.
+    fn twin(colors: YuvColors, y: u8, u: u8, v: u8) -> [f64; 3] {
+        let [red_weight, blue_weight] = colors.luma_weights();
+        let [y, u, v] = [y, u, v].map(f64::from);
+        let (luma, blue_difference, red_difference) = match colors.range {
+            YuvRange::Limited => ((y - 16.0) / 219.0, (u - 128.0) / 224.0, (v - 128.0) / 224.0),
+            YuvRange::Full => (y / 255.0, (u - 128.0) / 255.0, (v - 128.0) / 255.0),
+        };
+        let red = luma + 2.0 * (1.0 - red_weight) * red_difference;
+        let blue = luma + 2.0 * (1.0 - blue_weight) * blue_difference;
+        let green = (luma - red_weight * red - blue_weight * blue) / (1.0 - red_weight - blue_weight);
+        [red, green, blue].map(|color| (color * 255.0).clamp(0.0, 255.0))
+    }
+
+    #[test]
+    fn every_count_is_within_one_of_the_twin() {
+        const OFF: f64 = 0.54; // Half a count of rounding and what `Fixed` says.
+        for colors in all_colors() {
+            let fixed = Fixed::new(colors);
+            for y in 0..=255 {
+                for u in (0..=255).step_by(5) {
+                    for v in (0..=255).step_by(3) {
+                        let got = fixed.pair([y, 255 - y, u, v]);
+                        for (got, wanted) in
+                            got.iter().zip(twin(colors, y, u, v).into_iter().chain(twin(colors, 255 - y, u, v)))
+                        {
+                            assert!(
+                                (f64::from(*got) - wanted).abs() <= OFF,
+                                "{colors:?} {y} {u} {v}: {got}, wanted {wanted}"
+                            );
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn published_colors_come_out() {
+        let limited = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited };
+        let of = |colors: YuvColors, y, u, v| rgb(YuvLayout::Yuyv, colors, [1, 1], &[y, u, 0, v]);
+        assert_eq!(of(limited, 16, 128, 128), [0, 0, 0]);
+        assert_eq!(of(limited, 235, 128, 128), [255, 255, 255]);
+        assert_eq!(of(limited, 81, 90, 240), [254, 0, 0]); // Bars of BT.601: red; the counts are rounded, so red is not full.
+        assert_eq!(of(limited, 41, 240, 110), [0, 0, 255]);
+        let high = YuvColors { matrix: YuvMatrix::Bt709, range: YuvRange::Limited };
+        assert_eq!(of(high, 63, 102, 240), [255, 1, 0]); // Bars of BT.709.
+        let full = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Full };
+        assert_eq!(of(full, 76, 85, 255), [254, 0, 0]); // JFIF's red.
+    }
+
+    #[test]
+    fn all_layouts_of_one_picture_give_the_same_pixels_at_odd_sizes() {
+        let colors = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Full };
+        let luma = |x: usize, y: usize| (20 + 31 * x + 47 * y).to_le_bytes()[0];
+        let difference = |x: usize, y: usize, plus: usize| (90 + plus + 13 * (x / 2) + 7 * (y / 2)).to_le_bytes()[0];
+        for size_px in [[1, 1], [2, 2], [5, 3], [4, 3], [7, 2]] {
+            let [width, height] = size_px.map(|side| side as usize);
+            let pairs = width.div_ceil(2);
+            let packed = |order: fn(u8, u8, u8, u8) -> [u8; 4]| -> Vec<u8> {
+                let pair =
+                    |x: usize, y: usize| order(luma(x, y), luma(x + 1, y), difference(x, y, 0), difference(x, y, 40));
+                (0..height).flat_map(|y| (0..pairs).flat_map(move |pair_ix| pair(2 * pair_ix, y))).collect()
+            };
+            let lumas = (0..height).flat_map(|y| (0..2 * pairs).map(move |x| luma(x, y)));
+            let differences = (0..height.div_ceil(2)).flat_map(|row| {
+                (0..pairs).flat_map(move |pair| [0, 40].map(|plus| difference(2 * pair, 2 * row, plus)))
+            });
+            let images = [
+                packed(|y0, y1, u, v| [y0, u, y1, v]),
+                packed(|y0, y1, u, v| [u, y0, v, y1]),
+                lumas.chain(differences).collect(),
+            ];
+            for (layout, data) in LAYOUTS.into_iter().zip(images) {
+                assert_eq!(data.len(), layout.row_bytes(width) * layout.n_rows(height), "{layout:?}");
+                let got = rgb(layout, colors, size_px, &data);
+                for (ix, got) in got.chunks_exact(3).enumerate() {
+                    let (x, y) = (ix % width, ix / width);
+                    let wanted = twin(colors, luma(x, y), difference(x, y, 0), difference(x, y, 40));
+                    for (got, wanted) in got.iter().zip(wanted) {
+                        assert!((f64::from(*got) - wanted).abs() <= 1.0, "{layout:?} {width}x{height} at {x}, {y}");
+                    }
+                }
+                assert_eq!(got.len(), width * height * 3);
+            }
+        }
+    }
+
+    #[test]
+    fn devices_defaults_are_those_of_v4l2() {
+        let settled = |colorspace, ycbcr_enc, quantization, is_hdtv| {
+            let told = V4l2Colors { colorspace, ycbcr_enc, quantization, is_hdtv };
+            YuvColors::from_v4l2(told).map(|colors| (colors.matrix, colors.range)).ok()
+        };
+        use YuvMatrix::{Bt601, Bt709};
+        use YuvRange::{Full, Limited};
+        assert_eq!(settled(0, 0, 0, false), Some((Bt601, Limited))); // Nothing told: sRGB.
+        assert_eq!(settled(0, 0, 0, true), Some((Bt709, Limited))); // An HDMI grabber.
+        assert_eq!(settled(1, 0, 0, true), Some((Bt601, Limited))); // SMPTE 170M
+        assert_eq!(settled(3, 0, 0, false), Some((Bt709, Limited))); // Rec. 709
+        assert_eq!(settled(7, 0, 0, false), Some((Bt601, Full))); // JPEG
+        assert_eq!(settled(8, 0, 1, false), Some((Bt601, Full))); // sRGB, told to be full.
+        assert_eq!(settled(8, 2, 0, false), Some((Bt709, Limited)));
+        assert_eq!(settled(7, 0, 2, false), Some((Bt601, Limited)));
+        assert_eq!(settled(12, 0, 0, false), Some((Bt709, Limited))); // DCI-P3
+        assert_eq!(settled(10, 0, 0, false), None); // BT.2020
+        assert_eq!(settled(2, 0, 0, false), None); // SMPTE 240M
+        assert_eq!(settled(2, 1, 0, false), Some((Bt601, Limited)));
+        assert_eq!(settled(8, 6, 0, false), None);
+    }
+
+    #[test]
+    #[ignore = "a measurement: prints milliseconds"]
+    fn speed_at_1080p() {
+        let colors = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited };
+        for layout in LAYOUTS {
+            let n_bytes = layout.row_bytes(1920) * layout.n_rows(1080);
+            let data: Vec<u8> = (0..n_bytes).map(|ix| (ix * 37).to_le_bytes()[0]).collect();
+            let best = (0..20).map(|_| {
+                let began = std::time::Instant::now();
+                std::hint::black_box(rgb(layout, colors, [1920, 1080], std::hint::black_box(&data)));
+                began.elapsed()
+            });
+            eprintln!("{layout:?} 1920x1080: {:.2?} at best", best.min().expect("20 runs"));
+        }
+    }
+}

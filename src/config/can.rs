@@ -1,0 +1,202 @@
+//! The keys of arms on CAN buses: `[arm.bus.NAME]` and `[arm.motor.NAME]`.
+
+use super::section::Section;
+use super::write::{is, name_of, table, whole};
+use drivers::can::{BusConfig, Family, MotorConfig};
+use drivers::wire::can::cia402::Units;
+use drivers::wire::can::{canopen, odrive, robstride, tmotor};
+use toml::{Table, Value};
+
+/// A family without its numbers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Kind {
+    Damiao,
+    Robstride,
+    TMotor,
+    Odrive,
+    Cia402,
+}
+
+const FAMILIES: [(&str, Kind); 5] = [
+    ("damiao", Kind::Damiao),
+    ("robstride", Kind::Robstride),
+    ("tmotor", Kind::TMotor),
+    ("odrive", Kind::Odrive),
+    ("cia402", Kind::Cia402),
+];
+
+/// The models whose counts the driver knows, of both families whose motors do not tell.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Model {
+    Robstride(robstride::Model),
+    TMotor(tmotor::Model),
+}
+
+const MODELS: [(&str, Model); 13] = [
+    ("rs00", Model::Robstride(robstride::Model::Rs00)),
+    ("rs01", Model::Robstride(robstride::Model::Rs01)),
+    ("rs02", Model::Robstride(robstride::Model::Rs02)),
+    ("rs03", Model::Robstride(robstride::Model::Rs03)),
+    ("rs04", Model::Robstride(robstride::Model::Rs04)),
+    ("rs05", Model::Robstride(robstride::Model::Rs05)),
+    ("rs06", Model::Robstride(robstride::Model::Rs06)),
+    ("ak10-9", Model::TMotor(tmotor::Model::Ak10x9)),
+    ("ak60-6", Model::TMotor(tmotor::Model::Ak60x6)),
+    ("ak70-10", Model::TMotor(tmotor::Model::Ak70x10)),
+    ("ak80-6", Model::TMotor(tmotor::Model::Ak80x6)),
+    ("ak80-9", Model::TMotor(tmotor::Model::Ak80x9)),
+    ("ak80-64", Model::TMotor(tmotor::Model::Ak80x64)),
+];
+/// Gears beyond these are slips of the pen.
+const GEARS: std::ops::RangeInclusive<f64> = 0.001..=10_000.0;
+
+/// Buses and motors, in the order of their names.
+pub(super) fn read(keys: &mut Section<'_>) -> (Vec<BusConfig>, Vec<MotorConfig>) {
+    let buses: Vec<BusConfig> = keys.named_sections("bus").into_iter().map(|(name, keys)| bus(name, keys)).collect();
+    let motors = keys.named_sections("motor").into_iter().filter_map(|(joint, keys)| motor(joint, keys, &buses));
+    let motors = motors.collect();
+    (buses, motors)
+}
+
+fn bus(interface: String, mut keys: Section<'_>) -> BusConfig {
+    let rate = |value: Option<u64>| value.and_then(|rate| u32::try_from(rate).ok());
+    let bus = BusConfig {
+        interface,
+        bitrate_hz: rate(keys.whole("bitrate_hz", 10_000..=1_000_000)).unwrap_or(1_000_000),
+        data_bitrate_hz: rate(keys.whole("data_bitrate_hz", 10_000..=8_000_000)),
+    };
+    keys.end();
+    bus
+}
+
+/// `None` where something is wrong, which has been told.
+fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<MotorConfig> {
+    let kind = keys.choice("family", &FAMILIES);
+    if kind.is_none() {
+        keys.missing("family", "damiao, robstride, tmotor, odrive or cia402");
+    }
+    let bus = keys.text("bus");
+    if bus.is_none() {
+        keys.missing("bus", "the interface that it is on, which has a table [arm.bus.NAME]");
+    }
+    let bus_ix = bus.and_then(|bus| {
+        let found = buses.iter().position(|known| known.interface == bus);
+        let names: Vec<_> = buses.iter().map(|bus| format!("{:?}", bus.interface)).collect();
+        let allowed = if names.is_empty() { "the name of a table [arm.bus.NAME]".to_owned() } else { names.join(", ") };
+        found.or_else(|| keys.wrong("bus", &Value::String(bus), &allowed))
+    });
+    let most = match kind {
+        Some(Kind::Damiao) => 0x7FE,
+        Some(Kind::Odrive) => 62,
+        Some(Kind::Cia402) => 127,
+        _ => 255,
+    };
+    let id = keys.whole("id", u64::from(kind == Some(Kind::Cia402))..=most);
+    if id.is_none() {
+        keys.missing("id", "the number of the motor, axis or node");
+    }
+    // Keys of other families are unknown here; where it is not known which it is, all are known.
+    let is = |own: &[Kind]| kind.is_none_or(|kind| own.contains(&kind));
+    let feedback = is(&[Kind::Damiao]).then(|| keys.whole("feedback_id", 0..=0x7FE)).flatten();
+    let model = is(&[Kind::Robstride, Kind::TMotor]).then(|| keys.choice("model", &MODELS)).flatten();
+    let counts_per_turn = is(&[Kind::Cia402]).then(|| keys.number("counts_per_turn", 1.0..=1e12)).flatten();
+    let rated_torque_nm = is(&[Kind::Cia402]).then(|| keys.number("rated_torque_nm", 0.0..=1e6)).flatten();
+    let rated_torque_nm = rated_torque_nm.unwrap_or(0.0);
+    let gear_ratio = keys.number("gear_ratio", GEARS).unwrap_or(1.0);
+    let is_reversed = keys.flag("reversed").unwrap_or(false);
+    let offset_rad = keys.number("offset_rad", -100.0..=100.0).unwrap_or(0.0);
+    let narrow = |id: u64| u8::try_from(id).ok();
+    let Some(kind) = kind else {
+        keys.end();
+        return None;
+    };
+    let family = match (kind, id) {
+        (Kind::Damiao, id) => {
+            if feedback.is_none() {
+                keys.missing("feedback_id", "the identifier of the motor's answers, its register MST_ID");
+            }
+            let short = |id: u64| u16::try_from(id).ok();
+            id.and_then(short).zip(feedback.and_then(short)).map(|(motor, feedback)| Family::Damiao { motor, feedback })
+        }
+        (kind @ (Kind::Robstride | Kind::TMotor), id) => {
+            let family = match (kind, model, id.and_then(narrow)) {
+                (Kind::Robstride, Some(Model::Robstride(model)), Some(motor)) => {
+                    Some(Family::Robstride { motor, model })
+                }
+                (Kind::TMotor, Some(Model::TMotor(model)), Some(motor)) => Some(Family::TMotor { motor, model }),
+                _ => None,
+            };
+            if family.is_none() && id.is_some() {
+                keys.missing("model", "what is on the motor: rs00 to rs06 of Robstride, ak10-9 to ak80-64 of T-Motor");
+            }
+            family
+        }
+        (Kind::Odrive, id) => {
+            id.and_then(narrow).and_then(|id| odrive::Node::new(id).ok()).map(|node| Family::Odrive { node })
+        }
+        (Kind::Cia402, id) => {
+            if counts_per_turn.is_none() {
+                keys.missing("counts_per_turn", "counts of the drive's position in a turn of what it measures");
+            }
+            let node = id.and_then(narrow).and_then(|id| canopen::Node::new(id).ok());
+            let units = counts_per_turn.map(|counts_per_turn| Units { counts_per_turn, rated_torque_nm });
+            node.zip(units).map(|(node, units)| Family::Cia402 { node, units })
+        }
+    };
+    keys.end();
+    Some(MotorConfig { joint, bus_ix: bus_ix?, family: family?, gear_ratio, is_reversed, offset_rad })
+}
+
+/// The tables of buses and motors; none where there are none.
+pub(super) fn write(buses: &[BusConfig], motors: &[MotorConfig]) -> [Option<Value>; 2] {
+    let bus = |bus: &BusConfig| {
+        table([
+            ("bitrate_hz", whole(bus.bitrate_hz.into())),
+            ("data_bitrate_hz", bus.data_bitrate_hz.and_then(|rate| whole(rate.into()))),
+        ])
+    };
+    let named = |tables: Table| (!tables.is_empty()).then_some(Value::Table(tables));
+    let buses_table = buses.iter().map(|config| (config.interface.clone(), Value::Table(bus(config)))).collect();
+    let motors_table = motors
+        .iter()
+        .map(|config| (config.joint.clone(), Value::Table(motor_table(config, &buses[config.bus_ix].interface))))
+        .collect();
+    [named(buses_table), named(motors_table)]
+}
+
+fn motor_table(motor: &MotorConfig, bus: &str) -> Table {
+    let mut model = None;
+    let mut feedback = None;
+    let mut units = None;
+    let (kind, id) = match motor.family {
+        Family::Damiao { motor, feedback: answers } => {
+            feedback = Some(answers);
+            (Kind::Damiao, motor)
+        }
+        Family::Robstride { motor, model: own } => {
+            model = Some(Model::Robstride(own));
+            (Kind::Robstride, motor.into())
+        }
+        Family::TMotor { motor, model: own } => {
+            model = Some(Model::TMotor(own));
+            (Kind::TMotor, motor.into())
+        }
+        Family::Odrive { node } => (Kind::Odrive, node.number().into()),
+        Family::Cia402 { node, units: own } => {
+            units = Some(own);
+            (Kind::Cia402, node.number().into())
+        }
+    };
+    table([
+        ("family", name_of(&FAMILIES, &kind)),
+        ("bus", is(bus)),
+        ("id", whole(id.into())),
+        ("feedback_id", feedback.and_then(|id| whole(id.into()))),
+        ("model", model.and_then(|model| name_of(&MODELS, &model))),
+        ("counts_per_turn", units.and_then(|units| is(units.counts_per_turn))),
+        ("rated_torque_nm", units.and_then(|units| is(units.rated_torque_nm))),
+        ("gear_ratio", is(motor.gear_ratio)),
+        ("reversed", is(motor.is_reversed)),
+        ("offset_rad", is(motor.offset_rad)),
+    ])
+}
