@@ -1,4 +1,4 @@
-//! Arms whose joints are motors on CAN buses: Linux SocketCAN, one thread a bus. Nothing here commands a motor.
+//! Arms whose joints are motors on CAN buses: Linux sockets, one thread a bus. Nothing here commands a motor.
 //!
 //! `link` checks how an interface is set up, `bus` moves frames and counts what is wrong on the wire, `motor` speaks to one motor
 //! of any family, `arm` makes joint states of what all of them say. `played` is the other side: motors for tests and simulators.

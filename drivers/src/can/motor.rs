@@ -1,7 +1,7 @@
 //! One motor of any family: what is said to it so that it tells where it is, and what its frames mean for its joint.
 //!
 //! Reading never commands: Damiao motors are asked for feedback, Robstride motors report by themselves once they are told to,
-//! ODrives send their cyclic messages, CiA 402 drives answer each SYNC with a PDO. An AK motor in MIT mode speaks only when it is
+//! `ODrive` axes send their cyclic messages, CiA 402 drives answer each SYNC with a PDO. An AK motor in MIT mode speaks only when it is
 //! commanded, and a command without gains would make it limp: so it is only listened to, while another master commands it.
 
 use super::ROBSTRIDE_HOST;
@@ -27,7 +27,7 @@ const MAX_REPORT: Duration = Duration::from_secs(1);
 const SHORTEST_REPORT: u32 = 1;
 /// Seconds from report to report at that value.
 const ROBSTRIDE_REPORT_SECS: f64 = 0.01;
-/// ODrives' usual interval of the encoder's message.
+/// The usual interval of an `ODrive` encoder's message.
 const ODRIVE_REPORT_SECS: f64 = 0.01;
 /// An interval at which a drive sends its heartbeat, milliseconds.
 const HEARTBEAT_MILLIS: i64 = 500;

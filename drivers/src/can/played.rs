@@ -14,9 +14,9 @@ use kinematics::Stamp;
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-/// How often ODrives and Robstride motors report by themselves.
+/// How often `ODrive` axes and Robstride motors report by themselves.
 const REPORT: Duration = Duration::from_millis(10);
-/// How often drives and ODrives say that they live.
+/// How often drives and `ODrive` axes say that they live.
 const HEARTBEAT: Duration = Duration::from_millis(100);
 /// Of windings and drives, degrees Celsius.
 const CELSIUS: u8 = 30;
