@@ -26,6 +26,8 @@ pub struct V4l2Camera {
     last: Option<Stamp>,
     /// Set from a loss to the next image.
     outage: Option<Outage>,
+    /// Whether an image was asked for yet.
+    is_asked: bool,
 }
 
 /// A time without images.
@@ -65,7 +67,14 @@ impl V4l2Camera {
         }
         let running = Running::start(&config)?;
         log::info!("camera {:?}: {}", config.name, running.describe());
-        Ok(Self { config, link: Link::Up(Box::new(running)), counts: Counts::default(), last: None, outage: None })
+        Ok(Self {
+            config,
+            link: Link::Up(Box::new(running)),
+            counts: Counts::default(),
+            last: None,
+            outage: None,
+            is_asked: false,
+        })
     }
 
     /// What became of it so far.
@@ -84,6 +93,11 @@ impl V4l2Camera {
     /// One step of waiting for an image of a camera that is there.
     fn wait_for_image(&mut self, deadline: Instant) -> Result<Option<Image>, Error> {
         let Link::Up(running) = &mut self.link else { return Ok(None) };
+        if !std::mem::replace(&mut self.is_asked, true)
+            && let Err(problem) = running.forget_waiting()
+        {
+            return self.lose(problem).map(|()| None);
+        }
         let (n_damaged, image) = (running.n_damaged(), running.next_image(&self.config, deadline));
         self.counts.n_damaged += running.n_damaged() - n_damaged;
         let image = match image {

@@ -122,6 +122,16 @@ impl Running {
         self.last_whole.elapsed()
     }
 
+    /// Drops what came before anybody asked: it counts as lost no more than what came before the stream began.
+    pub(super) fn forget_waiting(&mut self) -> Result<(), Problem> {
+        for _ in 0..N_BUFFERS {
+            let Some(filled) = self.stream.take().map_err(lost)? else { break };
+            self.stream.give_back(filled).map_err(lost)?;
+        }
+        self.sequence = Sequence::default();
+        Ok(())
+    }
+
     /// The next image, or `None` when none came until the deadline; an error means that the device is lost.
     pub(super) fn next_image(&mut self, config: &Config, deadline: Instant) -> Result<Option<Image>, Problem> {
         loop {
