@@ -6,6 +6,7 @@ pub mod clock;
 pub mod dataset;
 mod decode;
 mod error;
+pub mod franka;
 pub mod jpeg;
 mod live;
 pub mod recording;

@@ -2,7 +2,7 @@
 
 mod base;
 mod counts;
-mod order;
+pub(crate) mod order;
 mod receiver;
 mod scanner;
 #[cfg(test)]
