@@ -115,7 +115,7 @@ impl Limits {
 
     /// Checks a step from where joints were wanted to where they are wanted now.
     pub(super) fn check(&self, before: &Wanted, now: &Wanted) -> Result<(), Violation> {
-        let over = |number: f64, most: f64| !(number.abs() <= most + ROUNDING);
+        let over = |number: f64, most: f64| number.is_nan() || number.abs() > most + ROUNDING;
         for ix in 0..N_JOINTS {
             let (position, velocity) = (now.position_rad[ix], now.velocity_rad_s[ix]);
             let [least, greatest] = self.position_rad[ix];

@@ -214,7 +214,7 @@ impl Robot {
     pub(super) fn observe(&mut self, joints: Joints) -> Option<Reply> {
         self.joints = joints;
         let Mode::Move(_) = self.mode else {
-            let is_off = |(wanted, is): (f64, f64)| !((wanted - is).abs() <= SAG_RAD);
+            let is_off = |(wanted, is): (f64, f64)| (wanted - is).abs() > SAG_RAD;
             if self.wanted.position_rad.into_iter().zip(joints.position_rad).any(is_off) {
                 self.wanted.position_rad = joints.position_rad;
             }
