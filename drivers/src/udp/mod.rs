@@ -1,5 +1,6 @@
-//! Range scanners and bases that send JSON datagrams; the format is in `docs/udp.md`, its codec in `wire/datagram.rs`.
+//! Arms, range scanners and bases that send JSON datagrams; the format is in `docs/udp.md`, its codec in `wire/datagram.rs`.
 
+mod arm;
 mod base;
 mod counts;
 pub(crate) mod order;
@@ -7,7 +8,9 @@ mod receiver;
 mod scanner;
 #[cfg(test)]
 mod tests;
+mod whole;
 
+pub use arm::UdpArm;
 pub use base::UdpBase;
 pub use counts::Counts;
 pub use scanner::UdpScanner;
