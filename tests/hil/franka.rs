@@ -1,6 +1,8 @@
 //! The Franka driver and the controller that we play against what others made of the same protocol: libfranka itself as a client
 //! (`pylibfranka`), and `franka-sim` as a controller. Both come from PyPI into a virtual environment that is made once.
 
+#![cfg(target_os = "linux")]
+
 use drivers::Arm;
 use drivers::franka::played::{Joints, Limits, PlayedRobot, RobotConfig, Wanted};
 use drivers::franka::{ArmConfig, FciVersion, FrankaArm, N_JOINTS};
