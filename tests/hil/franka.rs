@@ -1,5 +1,5 @@
 //! The Franka driver and the controller that we play against what others made of the same protocol: libfranka itself as a client
-//! (`pylibfranka`), and `franka-sim` as a controller. Both come from PyPI into a virtual environment that is made once.
+//! (`pylibfranka`), and `franka-sim` as a controller. Both come from the Python Package Index into a virtual environment that is made once.
 
 #![cfg(target_os = "linux")]
 
@@ -111,7 +111,7 @@ fn ten_thousand_states_come_from_somebody_elses_controller() {
 }
 
 fn chain(tip: &str) -> Chain {
-    Chain::from_urdf(URDF, "panda_link0", tip).unwrap()
+    Chain::from_urdf(URDF, "panda_link0", tip).expect("the description comes along")
 }
 
 /// A child that does not outlive the test.
