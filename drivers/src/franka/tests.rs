@@ -164,7 +164,26 @@ fn way(frac: f64, by_rad: f64) -> f64 {
 }
 
 /// Moves the fourth joint with franka-rs, which is libfranka's loop; without its limits and filters.
-fn move_by(client: &Robot, by_rad: f64, secs: f64) -> Result<(), FrankaError> {
+///
+/// On a machine so busy that the client is not woken for 20 ms the robot stops, as it should; then the motion begins anew.
+fn move_to(client: &Robot, goal_rad: f64, secs: f64) -> Result<(), FrankaError> {
+    const MAX_BEGUN: usize = 5;
+    let mut result = Ok(());
+    for _ in 0..MAX_BEGUN {
+        result = move_once(client, goal_rad, secs);
+        match &result {
+            Err(FrankaError::Control(stopped))
+                if stopped.last_motion_errors.get("communication_constraints_violation") =>
+            {
+                recover(client);
+            }
+            _ => return result,
+        }
+    }
+    result
+}
+
+fn move_once(client: &Robot, goal_rad: f64, secs: f64) -> Result<(), FrankaError> {
     let mut start = None;
     let mut time = 0.0;
     client.control_joint_positions(
@@ -173,7 +192,7 @@ fn move_by(client: &Robot, by_rad: f64, secs: f64) -> Result<(), FrankaError> {
             time += period.as_secs_f64();
             let frac = (time / secs).min(1.0);
             let mut q = start;
-            q[3] += way(frac, by_rad);
+            q[3] += way(frac, goal_rad - start[3]);
             let mut output = JointPositions::new(q);
             output.motion_finished = frac >= 1.0;
             output
@@ -184,18 +203,31 @@ fn move_by(client: &Robot, by_rad: f64, secs: f64) -> Result<(), FrankaError> {
     )
 }
 
+/// Clears a reflex, and waits for a state that says so: those from before may still be on their way.
+fn recover(client: &Robot) {
+    client.automatic_error_recovery().unwrap();
+    let until = Instant::now() + PATIENCE;
+    loop {
+        let state = client.read_once().unwrap();
+        if state.robot_mode == RobotMode::Idle && !state.current_errors.any() {
+            return;
+        }
+        assert!(Instant::now() < until, "{:?}", state.robot_mode);
+    }
+}
+
 #[test]
 fn a_motion_within_limits_arrives_and_one_beyond_ends_in_a_reflex_until_recovery() {
     for version in VERSIONS {
         let played = robot(version, obedient());
         let client = Robot::new(&played.address().to_string(), RealtimeConfig::Ignore).unwrap();
         assert_eq!(client.fci_version(), version);
-        move_by(&client, 0.1, 1.0).unwrap();
+        move_to(&client, REST_RAD[3] + 0.1, 1.0).unwrap();
         let arrived = client.read_once().unwrap();
         assert!((arrived.q[3] - (REST_RAD[3] + 0.1)).abs() < 1e-6, "{:?}", arrived.q);
         assert_eq!(arrived.robot_mode, RobotMode::Idle);
         // Half a radian in a fifth of a second takes up to 72 rad/s².
-        let stopped = match move_by(&client, 0.5, 0.2) {
+        let stopped = match move_to(&client, REST_RAD[3] + 0.6, 0.2) {
             Err(FrankaError::Control(stopped)) => stopped,
             other => panic!("{other:?}"),
         };
@@ -205,18 +237,9 @@ fn a_motion_within_limits_arrives_and_one_beyond_ends_in_a_reflex_until_recovery
         let state = client.read_once().unwrap();
         assert_eq!(state.robot_mode, RobotMode::Reflex);
         assert!(is_told(&state.current_errors));
-        assert!(move_by(&client, 0.1, 1.0).is_err(), "no motion before the recovery");
-        client.automatic_error_recovery().unwrap();
-        // States from before the recovery may still be on their way.
-        let until = Instant::now() + PATIENCE;
-        let recovered = loop {
-            let state = client.read_once().unwrap();
-            if state.robot_mode == RobotMode::Idle || Instant::now() > until {
-                break state;
-            }
-        };
-        assert_eq!((recovered.robot_mode, recovered.current_errors.any()), (RobotMode::Idle, false));
-        move_by(&client, -0.1, 1.0).unwrap();
+        assert!(move_to(&client, REST_RAD[3], 1.0).is_err(), "no motion before the recovery");
+        recover(&client);
+        move_to(&client, REST_RAD[3], 1.0).unwrap();
     }
 }
 
@@ -235,9 +258,9 @@ fn contacts_beyond_what_a_client_allows_end_a_motion() {
     let client = Robot::new(&played.address().to_string(), RealtimeConfig::Ignore).unwrap();
     client.set_collision_behavior_simple([5.0; 7], [10.0; 7], [20.0; 6], [40.0; 6]).unwrap();
     *touch_nm.lock().unwrap() = 9.0;
-    move_by(&client, 0.05, 0.5).unwrap();
+    move_to(&client, REST_RAD[3] + 0.05, 0.5).unwrap();
     *touch_nm.lock().unwrap() = 11.0;
-    match move_by(&client, 0.05, 0.5) {
+    match move_to(&client, REST_RAD[3], 0.5) {
         Err(FrankaError::Control(stopped)) => assert_eq!(stopped.last_motion_errors.names(), ["joint_reflex"]),
         other => panic!("{other:?}"),
     }
