@@ -68,6 +68,7 @@ for group in "$@"; do
         need libelf-dev "builds it"
         need libssl-dev "builds it"
         need busybox-static "starts the tests in it"
+        need python3-venv "holds the peers of Franka arms"
         ;;
     *)
         echo "install-packages: unknown group $group (build, gpu, sim, web, hil)" >&2

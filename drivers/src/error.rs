@@ -99,6 +99,14 @@ pub enum Error {
         /// What is wrong, and what mends it.
         reason: String,
     },
+    /// A Franka arm does not let us in, is another than the rig file says, or was lost.
+    #[error("arm at {address}: {reason}")]
+    Fci {
+        /// Of its controller.
+        address: String,
+        /// What is wrong, and what mends it.
+        reason: String,
+    },
     /// A simulated device failed.
     #[error("simulated rig: {reason}")]
     Simulation {

@@ -6,6 +6,8 @@ pub mod clock;
 pub mod dataset;
 mod decode;
 mod error;
+#[cfg(target_os = "linux")]
+pub mod franka;
 pub mod jpeg;
 mod live;
 pub mod recording;

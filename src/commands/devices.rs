@@ -51,7 +51,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         }
     }
     if !args.json {
-        print::line("Arms on the network (Franka's FCI) cannot be probed yet: nothing is sent to them from here.")?;
+        print::line(
+            "Arms on the network (Franka's FCI) are not looked for: `fieldrig doctor RIG.toml` checks the one of a rig file.",
+        )?;
     }
     Ok(Exit::Done)
 }

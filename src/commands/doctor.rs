@@ -1,5 +1,7 @@
 //! `fieldrig doctor`: what this machine lacks for a rig, each with the line that mends it.
 
+mod franka;
+
 use crate::config::Rig;
 use crate::exit::Exit;
 use crate::print;
@@ -72,6 +74,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     findings.push(cameras(Path::new("/dev")));
     findings.extend(v4l2::cameras().into_iter().flatten().filter_map(|camera| usb(&camera)));
     findings.extend(can(rig.as_ref()));
+    findings.extend(franka::franka(rig.as_ref()));
     findings.push(port(USUAL_ADDRESS));
     for finding in &findings {
         if args.json {

@@ -125,9 +125,6 @@ fn is_any_simulated(rig: &Rig) -> bool {
 
 /// The first device of a rig that has no driver yet.
 fn absent_device(rig: &Rig) -> Option<String> {
-    if !matches!(rig.arm.driver, ArmDriver::Sim | ArmDriver::Can | ArmDriver::None) {
-        return Some(format!("arm driver {:?}", format!("{:?}", rig.arm.driver).to_lowercase()));
-    }
     if matches!(rig.base.driver, BaseDriver::Tags | BaseDriver::Rgbd) {
         return Some(format!("base driver {:?}", format!("{:?}", rig.base.driver).to_lowercase()));
     }
@@ -186,11 +183,9 @@ mod tests {
 
     #[test]
     fn devices_without_a_driver_are_named_together_with_the_way_out() {
-        for (key, value, named) in [
-            ("arm.driver", "franka", "franka"),
-            ("base.driver", "tags", "tags"),
-            ("camera.wrist.driver", "realsense", "camera \"wrist\""),
-        ] {
+        for (key, value, named) in
+            [("base.driver", "tags", "tags"), ("camera.wrist.driver", "realsense", "camera \"wrist\"")]
+        {
             let rig = load("static-arm.toml", &[Override::new(key, value)]);
             let message = format!("{:#}", super::rig(rig, Devices::Real).err().expect("no such driver"));
             assert!(message.contains(named) && message.contains("--sim"), "{message}");
@@ -221,6 +216,56 @@ mod tests {
         let without_scale = [&standing[..3], &standing[5..]].concat();
         let message = refused(&without_scale);
         assert!(message.contains("camera.wrist.depth.device"), "{message}");
+    }
+
+    #[test]
+    fn an_arm_on_the_network_that_is_not_there_is_an_error_that_says_what_to_do() {
+        let refused = |driver: &str, address: &str| {
+            let overrides = [Override::new("arm.driver", driver), Override::new("arm.address", address)];
+            let opened = super::rig(load("static-arm.toml", &overrides), Devices::Real);
+            format!("{:#}", opened.err().expect("no such arm"))
+        };
+        for (driver, address, named) in
+            [("franka", "", "arm.address"), ("franka", "127.0.0.1:1", "FCI"), ("udp", "172.16.0.2", "arm.address")]
+        {
+            let message = refused(driver, address);
+            assert!(message.contains(named), "{driver} {address}: {message}");
+        }
+        let taken = std::net::UdpSocket::bind("127.0.0.1:0").expect("a free port");
+        let address = taken.local_addr().expect("bound").to_string();
+        assert!(refused("udp", &address).contains(&address));
+    }
+
+    #[cfg(all(feature = "sim", target_os = "linux"))]
+    #[test]
+    fn a_franka_arm_is_read_beside_simulated_cameras() {
+        use drivers::franka::FciVersion;
+        use drivers::franka::played::{Joints, Limits, PlayedRobot, RobotConfig};
+        const REST_RAD: [f64; 7] = [0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7];
+        // An arm that stands somewhere on a walking base is compared from its own foot on.
+        for name in ["static-arm.toml", "mobile-arm.toml"] {
+            let plain = load(name, &[]);
+            let chain = Chain::from_urdf(&plain.arm.urdf_text, "panda_link0", "panda_link8").expect("a Panda");
+            let config = RobotConfig {
+                address: "127.0.0.1:0".parse().expect("an address"),
+                version: FciVersion::V5,
+                chain,
+                flange_from_ee: kinematics::Transform::identity(),
+                limits: Limits::panda(),
+            };
+            let rest = Joints { position_rad: REST_RAD, ..Joints::default() };
+            let played = PlayedRobot::start(config, Box::new(move |_, _| rest)).expect("a free port");
+            let address = played.address().to_string();
+            let overrides = [Override::new("arm.driver", "franka"), Override::new("arm.address", &*address)];
+            let mut opened = super::rig(load(name, &overrides), Devices::Real).unwrap_or_else(|e| panic!("{e:#}"));
+            let joints = loop {
+                match opened.source.next_sample().expect("the rig works").expect("it does not end") {
+                    Sample::Joints(joints) => break joints,
+                    _ => continue,
+                }
+            };
+            assert_eq!(joints.position, REST_RAD, "{name}");
+        }
     }
 
     #[test]

@@ -1,13 +1,19 @@
 //! The devices of a rig that are not simulated.
 
 use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Depth, Rig, ScannerDriver};
-use anyhow::bail;
+use anyhow::{Context, bail};
 #[cfg(target_os = "linux")]
-use drivers::can::{ArmConfig, CanArm};
-use drivers::udp::{UdpBase, UdpScanner};
+use drivers::can::{self, CanArm};
+#[cfg(target_os = "linux")]
+use drivers::franka::{self, FrankaArm};
+use drivers::udp::{UdpArm, UdpBase, UdpScanner};
 use drivers::v4l2::{Config, Settings, V4l2Camera, V4l2Format};
 use drivers::{Arm, Base, Devices, RangeScanner};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
+
+/// Where joint states are listened for where nothing says otherwise: of this computer only.
+const USUAL_ARM_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7011);
 
 /// Opens them; a rig may have none.
 pub(super) fn open(rig: &Rig) -> anyhow::Result<Devices> {
@@ -18,9 +24,12 @@ pub(super) fn open(rig: &Rig) -> anyhow::Result<Devices> {
             devices.cameras.push(Box::new(V4l2Camera::open(config)?));
         }
     }
-    if rig.arm.driver == ArmDriver::Can {
-        devices.arm = Some(can_arm(rig)?);
-    }
+    devices.arm = match rig.arm.driver {
+        ArmDriver::None | ArmDriver::Sim => None,
+        ArmDriver::Can => Some(can_arm(rig)?),
+        ArmDriver::Franka => Some(franka_arm(rig)?),
+        ArmDriver::Udp => Some(udp_arm(rig)?),
+    };
     if rig.base.driver == BaseDriver::Udp {
         let base = UdpBase::open(rig.base.address)?;
         log::info!("base: listening on {}", base.address());
@@ -38,13 +47,49 @@ pub(super) fn open(rig: &Rig) -> anyhow::Result<Devices> {
 #[cfg(target_os = "linux")]
 fn can_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
     let Rig { arm, .. } = rig;
-    let config = ArmConfig { buses: arm.buses.clone(), motors: arm.motors.clone(), rate_hz: arm.rate_hz };
+    let config = can::ArmConfig { buses: arm.buses.clone(), motors: arm.motors.clone(), rate_hz: arm.rate_hz };
     Ok(Box::new(CanArm::open(&config)?))
 }
 
 #[cfg(not(target_os = "linux"))]
 fn can_arm(_rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
     bail!("arms on CAN buses are read on Linux only")
+}
+
+/// A Franka arm, over FCI.
+#[cfg(target_os = "linux")]
+fn franka_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
+    let Rig { arm, .. } = rig;
+    if arm.address.is_empty() {
+        bail!("arm.address is missing: that of the robot's controller, for instance \"172.16.0.2\"");
+    }
+    let robot = kinematics::urdf::Robot::parse(&arm.urdf_text).context("the arm's URDF")?;
+    let path = robot.path(&arm.base_link, &arm.flange_link).context("the arm's URDF")?;
+    // The robot tells poses in the link that its first joint turns against, wherever on the base that is.
+    let first = path.iter().find(|joint| arm.joints.contains(&joint.name));
+    let foot_link = first.map_or(&arm.base_link, |joint| &joint.parent);
+    let chain = kinematics::Chain::new(&robot, foot_link, &arm.flange_link).context("the arm's URDF")?;
+    let config = franka::ArmConfig { address: arm.address.clone(), joint_names: arm.joints.clone(), chain };
+    Ok(Box::new(FrankaArm::open(&config)?))
+}
+
+#[cfg(not(target_os = "linux"))]
+fn franka_arm(_rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
+    bail!("Franka arms are read on Linux only")
+}
+
+/// An arm that another program tells about.
+fn udp_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
+    let Rig { arm, .. } = rig;
+    let address = match &*arm.address {
+        "" => USUAL_ARM_ADDRESS,
+        text => text.parse().with_context(|| {
+            format!("arm.address is {text:?}: with the driver udp it is where to listen, like {USUAL_ARM_ADDRESS}")
+        })?,
+    };
+    let open = UdpArm::open(&arm.joints, address)?;
+    log::info!("arm: listening on {}", open.address());
+    Ok(Box::new(open))
 }
 
 /// The color images of a camera.

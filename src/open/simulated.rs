@@ -9,7 +9,7 @@ use std::sync::Arc;
 /// Opens the simulated rig, in lockstep or in real time as the rig file says; `real` devices deliver beside it in real time.
 pub(super) fn open(rig: &Rig, real: Devices) -> anyhow::Result<Box<dyn Source>> {
     let mut config = config_of(rig)?;
-    let any_real = real.base.is_some() || !real.scanners.is_empty() || !real.cameras.is_empty();
+    let any_real = real.arm.is_some() || real.base.is_some() || !real.scanners.is_empty() || !real.cameras.is_empty();
     if rig.sim.lockstep {
         if any_real {
             bail!("with sim.lockstep the simulation waits for whoever takes its samples, which real devices do not");
@@ -21,6 +21,7 @@ pub(super) fn open(rig: &Rig, real: Devices) -> anyhow::Result<Box<dyn Source>> 
     // In real time the end is found here: devices that end would look like devices that fail.
     (config.duration_secs, config.n_images) = (None, None);
     let sim::LiveRig { mut devices, truth, .. } = sim::open(&config)?.into_live(start)?;
+    devices.arm = real.arm.or(devices.arm);
     devices.base = devices.base.or(real.base);
     devices.scanners.extend(real.scanners);
     devices.cameras.extend(real.cameras);

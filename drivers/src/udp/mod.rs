@@ -1,13 +1,16 @@
-//! Range scanners and bases that send JSON datagrams; the format is in `docs/udp.md`, its codec in `wire/datagram.rs`.
+//! Arms, range scanners and bases that send JSON datagrams; the format is in `docs/udp.md`, its codec in `wire/datagram.rs`.
 
+mod arm;
 mod base;
 mod counts;
-mod order;
+pub(crate) mod order;
 mod receiver;
 mod scanner;
 #[cfg(test)]
 mod tests;
+mod whole;
 
+pub use arm::UdpArm;
 pub use base::UdpBase;
 pub use counts::Counts;
 pub use scanner::UdpScanner;

@@ -15,7 +15,7 @@ const MAX_AHEAD: Duration = Duration::from_millis(1);
 
 /// Where a datagram belongs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Place {
+pub(crate) enum Place {
     /// It begins a new scan or pose, and so many before it did not come.
     New { n_lost: u64 },
     /// It is of the newest one.
@@ -28,7 +28,7 @@ pub(super) enum Place {
 
 /// The numbers and stamps of one sender.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Order {
+pub(crate) struct Order {
     clock: ClockMap,
     newest: Option<(u64, Stamp)>,
     newest_stamp: Option<Stamp>,
@@ -36,7 +36,7 @@ pub(super) struct Order {
 
 impl Order {
     /// Where a datagram that arrived then belongs, by its number.
-    pub(super) fn place(&mut self, seq: u64, arrival: Stamp) -> Place {
+    pub(crate) fn place(&mut self, seq: u64, arrival: Stamp) -> Place {
         let Some((newest, since)) = self.newest else {
             self.newest = Some((seq, arrival));
             return Place::New { n_lost: 0 };
@@ -54,7 +54,7 @@ impl Order {
     }
 
     /// Our time of what a new datagram tells; `None` where that cannot be, or is not after the newest.
-    pub(super) fn stamp(&mut self, head: &Head, arrival: Stamp) -> Option<Stamp> {
+    pub(crate) fn stamp(&mut self, head: &Head, arrival: Stamp) -> Option<Stamp> {
         let stamp = match head.clock {
             Clock::Monotonic => Stamp(head.stamp_nanos),
             Clock::Device => self.clock.stamp(head.stamp_nanos, arrival),

@@ -1,8 +1,10 @@
 //! Over a real socket of the loopback interface.
 
-use super::{Counts, UdpBase, UdpScanner};
-use crate::wire::datagram::{Clock, Head, PoseDatagram, ScanPart, encode_pose, encode_scan};
-use crate::{Base, Devices, Error, Live, RangePoint, RangeScanner, Sample, Source, clock};
+use super::{Counts, UdpArm, UdpBase, UdpScanner};
+use crate::wire::datagram::{
+    Clock, Head, JointsDatagram, PoseDatagram, ScanPart, encode_joints, encode_pose, encode_scan,
+};
+use crate::{Arm, Base, Devices, Error, Live, RangePoint, RangeScanner, Sample, Source, clock};
 use kinematics::Transform;
 use std::net::{SocketAddr, UdpSocket};
 use std::time::{Duration, Instant};
@@ -142,6 +144,30 @@ fn base_poses_come_in_order_and_the_port_is_free_again() {
     assert!(taken.to_string().contains(&address.to_string()), "{taken}");
     drop(base);
     UdpBase::open(address).unwrap();
+}
+
+#[test]
+fn joint_states_come_in_order_and_those_of_other_joints_are_refused() {
+    let names = ["shoulder", "elbow"].map(str::to_owned);
+    let mut arm = UdpArm::open(&names, FREE_PORT.parse().unwrap()).unwrap();
+    let send = sender(arm.address());
+    assert_eq!(arm.joint_names(), names);
+    let state = |head, at: f64| JointsDatagram { head, position: vec![at, -at], velocity: vec![], effort: vec![at; 2] };
+    let turned = [names[1].clone(), names[0].clone()];
+    let heads: Vec<Head> = (0..4).map(now).collect();
+    for ix in [0, 2, 1, 3] {
+        send(&encode_joints(&state(heads[ix], ix as f64), &turned));
+        send(&encode_joints(&state(heads[ix], ix as f64), &names));
+    }
+    for ix in [0, 2, 3] {
+        let told = arm.read(PATIENCE).unwrap();
+        let at = ix as f64;
+        assert_eq!((told.stamp.0, told.position, told.effort), (heads[ix].stamp_nanos, vec![at, -at], vec![at; 2]));
+        assert!(told.velocity.is_empty());
+    }
+    assert!(matches!(arm.read(SHORT), Err(Error::NoJoints { .. })));
+    let expected = Counts { n_received: 8, n_refused: 4, n_lost: 1, n_late: 1, ..Counts::default() };
+    assert_eq!(arm.counts(), expected);
 }
 
 #[test]

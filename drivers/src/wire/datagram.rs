@@ -1,4 +1,4 @@
-//! What range scanners and bases send over UDP: one JSON object a datagram, every field in `docs/udp.md`.
+//! What arms, range scanners and bases send over UDP: one JSON object a datagram, every field in `docs/udp.md`.
 
 use super::Malformed;
 use crate::RangePoint;
@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 pub const VERSION: u32 = 1;
 /// Most datagrams that one scan may be cut into.
 pub const MAX_PARTS: u32 = 64;
-/// Coordinates and ranges beyond this are slips, metres.
+/// Coordinates, ranges and what joints do beyond this are slips, metres or whatever their unit is.
 const FAR_M: f64 = 1e4;
 /// Angles beyond this are slips, rad.
 const MOST_RAD: f64 = 100.0;
@@ -32,7 +32,7 @@ pub enum Clock {
 /// What every datagram says.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Head {
-    /// One more with every scan or pose.
+    /// One more with every scan, pose or joint state.
     pub seq: u64,
     /// Which clock the stamp is on.
     pub clock: Clock,
@@ -62,6 +62,19 @@ pub struct PoseDatagram {
     pub head: Head,
     /// Pose of the base.
     pub world_from_base: Transform,
+}
+
+/// What an arm's joints did.
+#[derive(Clone, Debug, PartialEq)]
+pub struct JointsDatagram {
+    /// When.
+    pub head: Head,
+    /// Radians or metres.
+    pub position: Vec<f64>,
+    /// Radians or metres per second; empty where the sender does not tell.
+    pub velocity: Vec<f64>,
+    /// Newton metres or newtons; empty where the sender does not tell.
+    pub effort: Vec<f64>,
 }
 
 /// What is looked at before anything else; other fields may be anything.
@@ -115,8 +128,25 @@ struct Pose {
     quat_xyzw: [f64; 4],
 }
 
+#[derive(Serialize, Deserialize)]
+struct WireJoints {
+    kind: String,
+    version: u32,
+    seq: u64,
+    clock: Clock,
+    stamp_nanos: i64,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    names: Option<Vec<String>>,
+    position: Vec<f64>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    velocity: Vec<f64>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    effort: Vec<f64>,
+}
+
 const SCAN: &str = "range";
 const POSE: &str = "base";
+const JOINTS: &str = "joints";
 
 fn one() -> u32 {
     1
@@ -158,6 +188,23 @@ pub fn encode_pose(pose: &PoseDatagram) -> Vec<u8> {
             xyz_m: world_from_base.translation.vector.into(),
             quat_xyzw: world_from_base.rotation.coords.into(),
         },
+    };
+    serde_json::to_vec(&wire).expect("numbers and lists always serialize")
+}
+
+/// The state of joints of these names as a datagram; every bit of it comes back from [`decode_joints`].
+pub fn encode_joints(joints: &JointsDatagram, names: &[String]) -> Vec<u8> {
+    let JointsDatagram { head, position, velocity, effort } = joints;
+    let wire = WireJoints {
+        kind: JOINTS.to_owned(),
+        version: VERSION,
+        seq: head.seq,
+        clock: head.clock,
+        stamp_nanos: head.stamp_nanos,
+        names: Some(names.to_vec()),
+        position: position.clone(),
+        velocity: velocity.clone(),
+        effort: effort.clone(),
     };
     serde_json::to_vec(&wire).expect("numbers and lists always serialize")
 }
@@ -218,6 +265,28 @@ pub fn decode_pose(bytes: &[u8]) -> Result<PoseDatagram, Malformed> {
         head: Head { seq: wire.seq, clock: wire.clock, stamp_nanos: wire.stamp_nanos },
         world_from_base: Transform::from_parts(Translation3::new(x, y, z), rotation),
     })
+}
+
+/// Reads the state of joints of these names; a sender that names them must name the same in the same order.
+pub fn decode_joints(bytes: &[u8], names: &[String]) -> Result<JointsDatagram, Malformed> {
+    check_kind(bytes, JOINTS)?;
+    let WireJoints { seq, clock, stamp_nanos, names: told, position, velocity, effort, .. } = parsed(bytes)?;
+    if told.is_some_and(|told| told != names) {
+        return Err(amiss("names are not those of arm.joints, in that order".to_owned()));
+    }
+    let n = names.len();
+    let fits = |name, numbers: &[f64], may_be_empty: bool| match numbers.len() {
+        0 if may_be_empty => Ok(()),
+        len if len != n => Err(amiss(format!("{name} has {len} numbers for {n} joints"))),
+        _ if numbers.iter().any(|number| number.abs() > FAR_M) => {
+            Err(amiss(format!("{name} has a number beyond {FAR_M}")))
+        }
+        _ => Ok(()),
+    };
+    fits("position", &position, false)?;
+    fits("velocity", &velocity, true)?;
+    fits("effort", &effort, true)?;
+    Ok(JointsDatagram { head: Head { seq, clock, stamp_nanos }, position, velocity, effort })
 }
 
 /// A place for each direction of a part, `None` without an echo.
@@ -306,6 +375,19 @@ mod tests {
         PoseDatagram { head: Head { clock: Clock::Device, ..HEAD }, world_from_base }
     }
 
+    fn names() -> Vec<String> {
+        ["a", "b", "c"].map(str::to_owned).to_vec()
+    }
+
+    fn joints() -> JointsDatagram {
+        JointsDatagram {
+            head: HEAD,
+            position: vec![0.1, -1.0 / 3.0, 3.0],
+            velocity: vec![1e-7, 0.0, -2.0],
+            effort: Vec::new(),
+        }
+    }
+
     fn refused_scan(fields: &str) -> String {
         let text = format!(
             r#"{{"kind":"range","version":1,"seq":1,"clock":"device","stamp_nanos":5,"frame":"lidar",{fields}}}"#
@@ -317,6 +399,7 @@ mod tests {
     fn what_is_sent_comes_back_bit_for_bit() {
         assert_eq!(decode_scan(&encode_scan(&part())).expect("own bytes"), part());
         assert_eq!(decode_pose(&encode_pose(&pose())).expect("own bytes"), pose());
+        assert_eq!(decode_joints(&encode_joints(&joints(), &names()), &names()).expect("own bytes"), joints());
     }
 
     #[test]
@@ -325,7 +408,9 @@ mod tests {
         let examples: Vec<&str> = page.lines().filter(|line| line.starts_with(r#"{"kind""#)).collect();
         let scans: Vec<ScanPart> = examples.iter().filter_map(|text| decode_scan(text.as_bytes()).ok()).collect();
         let poses = examples.iter().filter(|text| decode_pose(text.as_bytes()).is_ok()).count();
-        assert_eq!((examples.len(), scans.len(), poses), (3, 2, 1));
+        let names: Vec<String> = (1..=7).map(|n| format!("panda_joint{n}")).collect();
+        let joints = examples.iter().filter(|text| decode_joints(text.as_bytes(), &names).is_ok()).count();
+        assert_eq!((examples.len(), scans.len(), poses, joints), (5, 2, 1, 2));
         // Ahead, then a direction without echo, then to the left.
         let ranges = &scans[1].points;
         assert_eq!(ranges.len(), 2);
@@ -372,6 +457,24 @@ mod tests {
     }
 
     #[test]
+    fn joints_that_are_amiss_are_named() {
+        let good = String::from_utf8(encode_joints(&joints(), &names())).expect("text");
+        for (from, to, named) in [
+            (r#"["a","b","c"]"#, r#"["b","a","c"]"#, "arm.joints"),
+            (r#""position":["#, r#""position":[1,"#, "position has 4"),
+            (r#""position":["#, r#""position":[],"x":["#, "position has 0"),
+            (r#""position":["#, r#""position":[0,1e5,0],"x":["#, "beyond"),
+            (r#""position":["#, r#""position":[0,null,0],"x":["#, "null"),
+            (r#""velocity":["#, r#""velocity":[1],"x":["#, "velocity has 1"),
+            (r#""version":1"#, r#""version":1,"effort":[1,2]"#, "effort has 2"),
+        ] {
+            assert!(good.contains(from), "{from}");
+            let told = decode_joints(good.replace(from, to).as_bytes(), &names()).expect_err(to).to_string();
+            assert!(told.contains(named), "{to}: {told}");
+        }
+    }
+
+    #[test]
     fn a_senders_text_does_not_flood_the_log() {
         let long = format!(r#""a\n{}""#, "b".repeat(50_000));
         let text = String::from_utf8(encode_pose(&pose())).expect("text").replace(r#""device""#, &long);
@@ -381,14 +484,15 @@ mod tests {
 
     #[test]
     fn cut_bent_and_random_bytes_never_panic() {
-        for whole in [encode_scan(&part()), encode_pose(&pose())] {
+        for whole in [encode_scan(&part()), encode_pose(&pose()), encode_joints(&joints(), &names())] {
             for end in 0..whole.len() {
                 assert!(decode_scan(&whole[..end]).is_err() && decode_pose(&whole[..end]).is_err(), "{end}");
+                assert!(decode_joints(&whole[..end], &names()).is_err(), "{end}");
             }
             for ix in 0..8 * whole.len() {
                 let mut bent = whole.clone();
                 bent[ix / 8] ^= 1 << (ix % 8);
-                let _ = (decode_scan(&bent), decode_pose(&bent));
+                let _ = (decode_scan(&bent), decode_pose(&bent), decode_joints(&bent, &names()));
             }
         }
         let mut state = 1_u64;
@@ -399,6 +503,7 @@ mod tests {
         for len in 0..2000 {
             let bytes: Vec<u8> = (0..len % 300).map(|_| random()).collect();
             assert!(decode_scan(&bytes).is_err() && decode_pose(&bytes).is_err());
+            assert!(decode_joints(&bytes, &names()).is_err());
         }
         let deep = "[".repeat(60_000);
         assert!(decode_scan(format!(r#"{{"kind":"range","version":1,"points_m":{deep}"#).as_bytes()).is_err());

@@ -1,0 +1,310 @@
+//! An arm that is read: a thread takes the robot's states, the caller gets them as joint states.
+
+use super::session::{Session, sentence};
+use super::state::{MAX_STATE_BYTES, Numbered, decode, pose};
+use super::{N_JOINTS, Statistics, realtime};
+use crate::udp::order::{Order, Place};
+use crate::wire::datagram::{Clock, Head};
+use crate::{Arm, Error, clock};
+use franka::{FciVersion, RobotMode, RobotState};
+use kinematics::{Chain, JointState, Stamp, Transform};
+use std::collections::VecDeque;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+/// States that may wait for a slow caller, one second of them; then the oldest goes.
+const MAX_WAITING: usize = 1000;
+/// A robot that says nothing for so long is lost.
+const MAX_SILENCE: Duration = Duration::from_secs(1);
+/// Where our forward kinematics and the robot's own differ by more, one of them is of another robot.
+const MAX_OFF_M: f64 = 2e-3;
+const MAX_OFF_RAD: f64 = 0.5 / 180.0 * std::f64::consts::PI;
+const NANOS_PER_STATE: i64 = 1_000_000;
+
+/// An arm as the rig file has it.
+#[derive(Clone, Debug)]
+pub struct ArmConfig {
+    /// Host of the controller, with a port where that is not 1337.
+    pub address: String,
+    /// The seven joints, from the base to the flange.
+    pub joint_names: Vec<String>,
+    /// From the link that the first joint turns against to the flange.
+    pub chain: Chain,
+}
+
+/// A Franka arm that is read; nothing here moves it. Dropping it frees the robot's interface.
+#[derive(Debug)]
+pub struct FrankaArm {
+    device: String,
+    names: Vec<String>,
+    version: FciVersion,
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    state: Mutex<Waiting>,
+    arrived: Condvar,
+}
+
+/// What lies between the thread and the caller.
+#[derive(Debug, Default)]
+struct Waiting {
+    queue: VecDeque<JointState>,
+    statistics: Statistics,
+    error: Option<Error>,
+    stop: bool,
+}
+
+impl FrankaArm {
+    /// Connects, checks that the rig file describes this robot, and starts to read.
+    pub fn open(config: &ArmConfig) -> Result<Self, Error> {
+        let address = &config.address;
+        let fault = |reason| Error::Fci { address: address.clone(), reason };
+        let n = config.joint_names.len();
+        if n != N_JOINTS || config.chain.n_joints() != N_JOINTS {
+            return Err(fault(format!("the rig file names {n} joints of the arm, which has {N_JOINTS}")));
+        }
+        let session = Session::open(address)?;
+        let Session { network, version } = &session;
+        let version = *version;
+        let mut line = Line::new(address.clone(), version);
+        let until = clock::now() + MAX_SILENCE;
+        let mut buffer = [0; MAX_STATE_BYTES];
+        let first = loop {
+            // Whatever went wrong, a state may still come.
+            let n = network.udp.blocking_receive(&mut buffer).unwrap_or(0);
+            match decode(version, &buffer[..n]) {
+                Some(first) => break first.state,
+                None if clock::now() < until => {}
+                None => {
+                    return Err(fault(format!(
+                        "it sends no states: do UDP datagrams to port {} of this computer pass its firewall?",
+                        network.udp.port()
+                    )));
+                }
+            }
+        };
+        check_kinematics(config, &first).map_err(fault)?;
+        line.tell_mode(&first);
+        let shared = Arc::new(Shared::default());
+        let device = format!("arm at {address}");
+        let reading = Arc::clone(&shared);
+        let name = "franka".to_owned();
+        let thread = std::thread::Builder::new().name(name).spawn(move || line.run(&session, &reading));
+        let thread = thread.map_err(|source| Error::Thread { device: device.clone(), source })?;
+        log::info!("{device}: speaks version {} of FCI", if version == FciVersion::V5 { 5 } else { 10 });
+        Ok(Self { device, names: config.joint_names.clone(), version, shared, thread: Some(thread) })
+    }
+
+    /// The version that the controller speaks.
+    pub fn version(&self) -> FciVersion {
+        self.version
+    }
+
+    /// What became of the states so far.
+    pub fn statistics(&self) -> Statistics {
+        self.shared.lock().statistics.clone()
+    }
+}
+
+impl Arm for FrankaArm {
+    fn joint_names(&self) -> &[String] {
+        &self.names
+    }
+
+    /// Stamped by the robot's own clock, mapped to ours; efforts are the measured torques at the links, gravity among them.
+    fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
+        let until = Instant::now() + timeout;
+        let mut state = self.shared.lock();
+        loop {
+            if let Some(joints) = state.queue.pop_front() {
+                return Ok(joints);
+            }
+            if let Some(error) = state.error.take() {
+                return Err(error);
+            }
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Err(Error::NoJoints { waited: timeout });
+            }
+            state = self.shared.arrived.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+}
+
+impl Drop for FrankaArm {
+    fn drop(&mut self) {
+        self.shared.lock().stop = true;
+        if let Some(thread) = self.thread.take() {
+            // A thread that panicked has said so.
+            let _ = thread.join();
+        }
+        log::info!("{}: {}", self.device, self.statistics());
+    }
+}
+
+/// Compares the flange's pose by the rig file with that by the robot.
+fn check_kinematics(config: &ArmConfig, state: &RobotState) -> Result<(), String> {
+    let chain = &config.chain;
+    let said = |error: kinematics::Error| error.to_string();
+    let order = chain.order_in(&config.joint_names).map_err(said)?;
+    let q: Vec<f64> = order.iter().map(|ix| state.q[*ix]).collect();
+    let ours = chain.forward(&q).map_err(said)?;
+    let matrix = |name, matrix| pose(matrix).map_err(|error| format!("its {name} is no pose: {error}"));
+    let (base_from_ee, flange_from_ee) = (matrix("O_T_EE", &state.O_T_EE)?, matrix("F_T_EE", &state.F_T_EE)?);
+    let theirs = base_from_ee * flange_from_ee.inverse();
+    let (off_m, off_rad) = difference(&ours, &theirs);
+    if off_m <= MAX_OFF_M && off_rad <= MAX_OFF_RAD {
+        return Ok(());
+    }
+    let (ee_off_m, ee_off_rad) = difference(&ours, &base_from_ee);
+    let tip = chain.tip_link();
+    let usually = if ee_off_m <= MAX_OFF_M && ee_off_rad <= MAX_OFF_RAD {
+        format!(
+            "{tip:?} is where the robot has its end effector: arm.flange_link must name the flange, F_T_EE lies between them"
+        )
+    } else {
+        format!(
+            "usual causes: arm.flange_link is not the flange (panda_link8, fr3_link8), the end effector was changed in Desk since, \
+             arm.joints has another order, or arm.urdf is of another robot; {tip:?} is {} from the robot's end effector",
+            told_difference(ee_off_m, ee_off_rad)
+        )
+    };
+    Err(format!(
+        "the rig file puts {tip:?} at {}, the robot its flange (O_T_EE without F_T_EE) at {}, {} away; {usually}",
+        told(&ours),
+        told(&theirs),
+        told_difference(off_m, off_rad)
+    ))
+}
+
+fn difference(a: &Transform, b: &Transform) -> (f64, f64) {
+    let a_from_b = a.inverse() * b;
+    (a_from_b.translation.vector.norm(), a_from_b.rotation.angle())
+}
+
+fn told_difference(off_m: f64, off_rad: f64) -> String {
+    format!("{:.1} mm and {:.2} degrees", off_m * 1e3, off_rad.to_degrees())
+}
+
+fn told(pose: &Transform) -> String {
+    let [x, y, z] = pose.translation.vector.into();
+    let (roll, pitch, yaw) = pose.rotation.euler_angles();
+    let [roll, pitch, yaw] = [roll, pitch, yaw].map(f64::to_degrees);
+    format!("({x:.4}, {y:.4}, {z:.4}) m, roll {roll:.2}, pitch {pitch:.2}, yaw {yaw:.2} degrees")
+}
+
+/// What the reading thread keeps between states.
+struct Line {
+    address: String,
+    version: FciVersion,
+    order: Order,
+    mode: RobotMode,
+}
+
+impl Line {
+    fn new(address: String, version: FciVersion) -> Self {
+        Self { address, version, order: Order::default(), mode: RobotMode::Other }
+    }
+
+    fn run(mut self, session: &Session, shared: &Shared) {
+        realtime::claim(&format!("arm at {}", self.address));
+        if let Err(reason) = self.read(session, shared) {
+            shared.lock().error = Some(Error::Fci { address: self.address, reason });
+            shared.arrived.notify_all();
+        }
+    }
+
+    /// Takes states until it is told to stop; the reason why none come any more is an error.
+    fn read(&mut self, session: &Session, shared: &Shared) -> Result<(), String> {
+        let network = &session.network;
+        let mut buffer = [0; MAX_STATE_BYTES];
+        let mut heard = clock::now();
+        loop {
+            let received = network.udp.blocking_receive(&mut buffer);
+            let at = clock::now();
+            // From anywhere else it is no state.
+            let is_its = network.udp_peer().is_some_and(|peer| peer.ip() == network.server_ip);
+            let numbered = received.as_ref().ok().map(|n| decode(self.version, &buffer[..*n]).filter(|_| is_its));
+            let mut waiting = shared.lock();
+            if waiting.stop {
+                return Ok(());
+            }
+            match numbered {
+                Some(Some(numbered)) => {
+                    heard = at;
+                    self.take(&mut waiting, &numbered, at);
+                    drop(waiting);
+                    shared.arrived.notify_all();
+                    self.tell_mode(&numbered.state);
+                    continue;
+                }
+                Some(None) => waiting.statistics.n_refused += 1,
+                None => {}
+            }
+            drop(waiting);
+            network.tcp.throw_if_connection_closed().map_err(|error| sentence(&error))?;
+            let silence = at.duration_since(heard);
+            if silence > MAX_SILENCE {
+                return Err(format!("it has sent no state for {silence:.1?}"));
+            }
+        }
+    }
+
+    fn take(&mut self, waiting: &mut Waiting, numbered: &Numbered, at: Stamp) {
+        let Numbered { number, state } = numbered;
+        let statistics = &mut waiting.statistics;
+        match self.order.place(*number, at) {
+            Place::New { n_lost } => statistics.n_lost += n_lost,
+            Place::Restart => statistics.n_restarts += 1,
+            Place::Newest | Place::Late => {
+                statistics.n_late += 1;
+                return;
+            }
+        }
+        // The robot counts its states by its own clock, one a millisecond.
+        let stamp_nanos = i64::try_from(*number).unwrap_or(i64::MAX).saturating_mul(NANOS_PER_STATE);
+        let head = Head { seq: *number, clock: Clock::Device, stamp_nanos };
+        let Some(stamp) = self.order.stamp(&head, at) else {
+            statistics.n_refused += 1;
+            return;
+        };
+        statistics.count(at.duration_since(stamp));
+        if waiting.queue.len() >= MAX_WAITING {
+            waiting.queue.pop_front();
+            statistics.n_dropped += 1;
+        }
+        waiting.queue.push_back(JointState {
+            stamp,
+            position: state.q.to_vec(),
+            velocity: state.dq.to_vec(),
+            effort: state.tau_J.to_vec(),
+        });
+    }
+
+    /// Logs what the robot is doing whenever that changes.
+    fn tell_mode(&mut self, state: &RobotState) {
+        if state.robot_mode == self.mode {
+            return;
+        }
+        self.mode = state.robot_mode;
+        let (address, mode) = (&self.address, self.mode);
+        match mode {
+            RobotMode::Reflex => {
+                let reasons = state.last_motion_errors.names().join(", ");
+                log::warn!("arm at {address}: stopped by a reflex: {reasons}");
+            }
+            _ => log::info!("arm at {address}: mode {mode:?}"),
+        }
+    }
+}
+
+impl Shared {
+    /// The state, also after a thread panicked while it held it: the queue is never left half changed.
+    fn lock(&self) -> MutexGuard<'_, Waiting> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}

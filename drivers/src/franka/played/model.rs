@@ -1,0 +1,66 @@
+//! The description that a controller of FCI 10 serves of its robot.
+
+use super::Limits;
+use std::fmt::Write;
+
+/// Each joint's place after the one before it: x, y, z in metres, and the turn about x in quarter turns.
+///
+/// Source: `franka_description`; the FR3 has the Panda's lengths.
+const PLACES: [(f64, f64, f64, f64); 7] = [
+    (0.0, 0.0, 0.333, 0.0),
+    (0.0, 0.0, 0.0, -1.0),
+    (0.0, -0.316, 0.0, 1.0),
+    (0.0825, 0.0, 0.0, 1.0),
+    (-0.0825, 0.384, 0.0, -1.0),
+    (0.0, 0.0, 0.0, 1.0),
+    (0.088, 0.0, 0.0, 1.0),
+];
+
+/// A URDF of the joints with the limits that clients look for; no bodies.
+pub(super) fn urdf(limits: &Limits) -> String {
+    let mut text = String::from("<?xml version=\"1.0\"?>\n<robot name=\"fr3\">\n<link name=\"fr3_link0\"/>\n");
+    for (ix, (x, y, z, quarters)) in PLACES.into_iter().enumerate() {
+        let n = ix + 1;
+        let [lower, upper] = limits.position_rad[ix];
+        let velocity = limits.velocity_rad_s[ix];
+        let effort = if ix < 4 { 87 } else { 12 };
+        let roll = quarters * std::f64::consts::FRAC_PI_2;
+        let braking =
+            limits.braking.map_or((1e3, 0.0), |braking| (braking[ix].deceleration_rad_s2, braking[ix].margin_rad_s));
+        write!(
+            text,
+            "<link name=\"fr3_link{n}\"/>\n<joint name=\"fr3_joint{n}\" type=\"revolute\">\n<origin rpy=\"{roll} 0 0\" \
+             xyz=\"{x} {y} {z}\"/>\n<parent link=\"fr3_link{ix}\"/>\n<child link=\"fr3_link{n}\"/>\n<axis xyz=\"0 0 1\"/>\n\
+             <limit effort=\"{effort}\" lower=\"{lower}\" upper=\"{upper}\" velocity=\"{velocity}\"/>\n\
+             <position_based_velocity_limits deceleration_limit=\"{}\" velocity_offset=\"{}\"/>\n</joint>\n",
+            braking.0, braking.1
+        )
+        .expect("a string takes all");
+    }
+    text.push_str(
+        "<link name=\"fr3_link8\"/>\n<joint name=\"fr3_joint8\" type=\"fixed\">\n<origin rpy=\"0 0 0\" xyz=\"0 0 0.107\"/>\n\
+         <parent link=\"fr3_link7\"/>\n<child link=\"fr3_link8\"/>\n</joint>\n</robot>\n",
+    );
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use franka::JointVelocityLimitsConfig;
+    use kinematics::Chain;
+
+    #[test]
+    fn the_description_is_of_a_panda_and_has_the_limits() {
+        let text = urdf(&Limits::fr3());
+        let ours = Chain::from_urdf(&text, "fr3_link0", "fr3_link8").unwrap();
+        let panda = include_str!("../../../../kinematics/tests/data/panda.urdf");
+        let panda = Chain::from_urdf(panda, "link0", "link8").unwrap();
+        let q = [0.3, -0.7, 0.2, -2.1, 0.4, 1.9, -0.8];
+        let off = ours.forward(&q).unwrap().inverse() * panda.forward(&q).unwrap();
+        assert!(off.translation.vector.norm() < 1e-9 && off.rotation.angle() < 1e-9, "{off}");
+        // What a client makes of it lies just inside of what is checked here.
+        let theirs = JointVelocityLimitsConfig::from_urdf(&text).unwrap().upper_limits(&q);
+        assert!((theirs[1] - 2.62).abs() < 1e-2, "{theirs:?}");
+    }
+}

@@ -1,0 +1,281 @@
+//! What a controller does: answers commands, follows motions within their limits, stops by reflex, recovers.
+
+use super::super::N_JOINTS;
+use super::super::state::pose;
+use super::limits::{STEP_SECS, Violation};
+use super::message::{Command, Reply, Request, Setting};
+use super::{Joints, RobotConfig, Wanted, model};
+use franka::wire::f64s_to_f64;
+use franka::wire::robot::{v5, v10};
+use franka::{Errors, FciVersion, MoveStatus};
+use kinematics::Transform;
+use std::collections::VecDeque;
+use zerocopy::FromBytes;
+use zerocopy::little_endian::F64;
+
+/// More answers missing in a row than this end a motion. Source: FCI documentation, "Real-time control commands".
+const MAX_MISSED: u32 = 20;
+/// States after which a motion must have begun.
+const MAX_UNTIL_FIRST: u32 = 1000;
+/// Over so many states the share of answered ones is told.
+const N_JUDGED: usize = 100;
+/// A robot at rest is wanted where it was put; further off it was moved otherwise, and is wanted where it is.
+const SAG_RAD: f64 = 0.01;
+/// Torques from outside that end a motion until a client sets others, Nm.
+const USUAL_CONTACT_NM: f64 = 20.0;
+
+/// The controller of one robot, without its sockets.
+pub(super) struct Robot {
+    pub(super) config: RobotConfig,
+    pub(super) nominal_from_ee: Transform,
+    pub(super) ee_from_stiffness: Transform,
+    contact_nm: [f64; N_JOINTS],
+    pub(super) joints: Joints,
+    pub(super) wanted: Wanted,
+    pub(super) mode: Mode,
+    pub(super) reflex_reason: Errors,
+    answered: VecDeque<bool>,
+}
+
+#[derive(Clone, Copy)]
+pub(super) enum Mode {
+    Idle,
+    Move(Motion),
+    Reflex,
+}
+
+#[derive(Clone, Copy)]
+pub(super) struct Motion {
+    command_id: u32,
+    pub(super) generator: Generator,
+    pub(super) controller: v10::ControllerMode,
+    has_begun: bool,
+    n_missed: u32,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum Generator {
+    Position,
+    Velocity,
+}
+
+impl Robot {
+    /// At rest where its owner says.
+    pub(super) fn new(config: RobotConfig, joints: Joints) -> Self {
+        let wanted = Wanted { position_rad: joints.position_rad, ..Wanted::default() };
+        Self {
+            config,
+            nominal_from_ee: Transform::identity(),
+            ee_from_stiffness: Transform::identity(),
+            contact_nm: [USUAL_CONTACT_NM; N_JOINTS],
+            joints,
+            wanted,
+            mode: Mode::Idle,
+            reflex_reason: Errors::default(),
+            answered: VecDeque::with_capacity(N_JUDGED),
+        }
+    }
+
+    /// Does what a client asks for, but for connecting, and answers; ending a motion answers twice.
+    pub(super) fn answer(&mut self, request: Request, command: u32, command_id: u32, payload: &[u8]) -> Vec<Reply> {
+        let is_moving = matches!(self.mode, Mode::Move(_));
+        let mut replies = Vec::new();
+        let payload = match request {
+            Request::Connect => return replies,
+            Request::Move => {
+                let status = self.begin(command_id, payload);
+                vec![self.move_byte(status)]
+            }
+            Request::Stop => {
+                replies.extend(self.end(MoveStatus::Preempted));
+                vec![0]
+            }
+            Request::Recover => {
+                if matches!(self.mode, Mode::Reflex) {
+                    self.mode = Mode::Idle;
+                    self.wanted = Wanted { position_rad: self.joints.position_rad, ..Wanted::default() };
+                }
+                vec![u8::from(is_moving)]
+            }
+            Request::Model => [&[0], model::urdf(&self.config.limits).as_bytes()].concat(),
+            Request::Library => vec![v5::LoadModelLibraryStatus::Error.to_u8()],
+            Request::Wall => vec![0; size_of::<v5::GetCartesianLimitResponse>()],
+            Request::Set(_) if is_moving => vec![v10::GetterSetterStatus::CommandNotPossibleRejected.to_u8()],
+            Request::Set(setting) => vec![self.set(setting, payload).to_u8()],
+        };
+        replies.push(Reply { command, command_id, payload });
+        replies
+    }
+
+    /// Begins a motion, if it can.
+    fn begin(&mut self, command_id: u32, payload: &[u8]) -> MoveStatus {
+        if !matches!(self.mode, Mode::Idle) {
+            return MoveStatus::CommandNotPossibleRejected;
+        }
+        let n_bytes = match self.config.version {
+            FciVersion::V5 => size_of::<v5::MoveRequest>(),
+            FciVersion::V10 => size_of::<v10::MoveRequest>(),
+        };
+        // Both begin with the controller and the motion generator.
+        let (Ok((head, _)), true) = (<[[u8; 4]; 2]>::read_from_prefix(payload), payload.len() == n_bytes) else {
+            return MoveStatus::InvalidArgumentRejected;
+        };
+        let [controller, generator] = head.map(u32::from_le_bytes);
+        let controller = match v10::MoveControllerMode::from_u32(controller) {
+            Some(v10::MoveControllerMode::JointImpedance) => v10::ControllerMode::JointImpedance,
+            Some(v10::MoveControllerMode::CartesianImpedance) => v10::ControllerMode::CartesianImpedance,
+            _ => return MoveStatus::InvalidArgumentRejected,
+        };
+        let generator = match v10::MoveMotionGeneratorMode::from_u32(generator) {
+            Some(v10::MoveMotionGeneratorMode::JointPosition) => Generator::Position,
+            Some(v10::MoveMotionGeneratorMode::JointVelocity) => Generator::Velocity,
+            _ => return MoveStatus::InvalidArgumentRejected,
+        };
+        self.mode = Mode::Move(Motion { command_id, generator, controller, has_begun: false, n_missed: 0 });
+        self.reflex_reason = Errors::default();
+        self.wanted.is_moving = true;
+        self.answered.clear();
+        MoveStatus::MotionStarted
+    }
+
+    fn set(&mut self, setting: Setting, payload: &[u8]) -> v10::GetterSetterStatus {
+        const WRONG: v10::GetterSetterStatus = v10::GetterSetterStatus::InvalidArgumentRejected;
+        if payload.len() != setting.n_bytes() {
+            return WRONG;
+        }
+        match setting {
+            Setting::EeToStiffness | Setting::NominalToEe => {
+                let Ok(matrix) = <[F64; 16]>::read_from_bytes(payload) else { return WRONG };
+                let Ok(pose) = pose(&f64s_to_f64(&matrix)) else { return WRONG };
+                match setting {
+                    Setting::NominalToEe => self.nominal_from_ee = pose,
+                    _ => self.ee_from_stiffness = pose,
+                }
+            }
+            Setting::Collision => {
+                let Ok(asked) = v10::SetCollisionBehaviorRequest::read_from_bytes(payload) else { return WRONG };
+                self.contact_nm = f64s_to_f64(&asked.upper_torque_thresholds_nominal);
+            }
+            Setting::JointImpedance
+            | Setting::CartesianImpedance
+            | Setting::Guiding
+            | Setting::Load
+            | Setting::Filters => {}
+        }
+        v10::GetterSetterStatus::Success
+    }
+
+    /// Follows the motion by a millisecond: by the client's answer to the newest state, or on as before without one.
+    ///
+    /// `had_time` says whether the client could have answered: a player that is late itself asks too much.
+    pub(super) fn follow(&mut self, command: Option<&Command>, had_time: bool) -> Option<Reply> {
+        let Mode::Move(mut motion) = self.mode else { return None };
+        if command.is_some() || (had_time && motion.has_begun) {
+            self.answered.truncate(N_JUDGED - 1);
+            self.answered.push_front(command.is_some());
+        }
+        let before = self.wanted;
+        let Some(command) = command else {
+            motion.n_missed += u32::from(had_time);
+            let most = if motion.has_begun { MAX_MISSED } else { MAX_UNTIL_FIRST };
+            if motion.n_missed > most {
+                return self.stop_by("communication_constraints_violation");
+            }
+            self.mode = Mode::Move(motion);
+            if motion.has_begun {
+                self.wanted =
+                    after(&before, |ix, _| before.velocity_rad_s[ix] + before.acceleration_rad_s2[ix] * STEP_SECS);
+            }
+            return None;
+        };
+        let now = after(&before, |ix, from| match motion.generator {
+            Generator::Position => (command.position_rad[ix] - from) / STEP_SECS,
+            Generator::Velocity => command.velocity_rad_s[ix],
+        });
+        if let Err(violation) = self.config.limits.check(&before, &now) {
+            let is_elsewhere = !motion.has_begun && motion.generator == Generator::Position;
+            let violation = if is_elsewhere { Violation::StartPose } else { violation };
+            return self.stop_by(violation.name());
+        }
+        self.wanted = now;
+        if !command.is_last {
+            self.mode = Mode::Move(Motion { has_begun: true, n_missed: 0, ..motion });
+            return None;
+        }
+        // It stands still from here on.
+        let brakes = |(velocity, most): (f64, f64)| velocity.abs() <= most * STEP_SECS;
+        match now.velocity_rad_s.into_iter().zip(self.config.limits.acceleration_rad_s2).all(brakes) {
+            true => self.end(MoveStatus::Success),
+            false => self.stop_by(Violation::Acceleration.name()),
+        }
+    }
+
+    /// Takes what the joints do now; a contact ends a motion.
+    pub(super) fn observe(&mut self, joints: Joints) -> Option<Reply> {
+        self.joints = joints;
+        let Mode::Move(_) = self.mode else {
+            let is_off = |(wanted, is): (f64, f64)| (wanted - is).abs() > SAG_RAD;
+            if self.wanted.position_rad.into_iter().zip(joints.position_rad).any(is_off) {
+                self.wanted.position_rad = joints.position_rad;
+            }
+            return None;
+        };
+        let is_hit = joints.external_torque_nm.into_iter().zip(self.contact_nm).any(|(nm, most)| nm.abs() > most);
+        if is_hit { self.stop_by("joint_reflex") } else { None }
+    }
+
+    /// The client is gone.
+    pub(super) fn abandon(&mut self) {
+        // Nobody is there to be told.
+        let _ = self.end(MoveStatus::Aborted);
+    }
+
+    /// Share of the last states of a motion that were answered in time, 0 to 1; 0 without one.
+    pub(super) fn success_frac(&self) -> f64 {
+        let n_answered = self.answered.iter().filter(|is_answered| **is_answered).count();
+        n_answered as f64 / self.answered.len().max(1) as f64
+    }
+
+    fn stop_by(&mut self, reason: &str) -> Option<Reply> {
+        let mut reasons = Errors::default();
+        reasons.0[Errors::index_of(reason)?] = true;
+        let reply = self.end(MoveStatus::ReflexAborted);
+        self.mode = Mode::Reflex;
+        self.reflex_reason = reasons;
+        log::info!("played robot: stopped by a reflex: {reason}");
+        reply
+    }
+
+    /// Ends the motion where one runs, and answers what began it.
+    fn end(&mut self, status: MoveStatus) -> Option<Reply> {
+        let Mode::Move(Motion { command_id, .. }) = self.mode else { return None };
+        self.mode = Mode::Idle;
+        self.wanted = Wanted { position_rad: self.wanted.position_rad, ..Wanted::default() };
+        Some(Reply { command: v10::Command::Move.to_u32(), command_id, payload: vec![self.move_byte(status)] })
+    }
+
+    /// A status as its version numbers it.
+    fn move_byte(&self, status: MoveStatus) -> u8 {
+        match (self.config.version, status) {
+            (FciVersion::V10, _) => status.to_u8(),
+            (_, MoveStatus::Success) => v5::MoveStatus::Success.to_u8(),
+            (_, MoveStatus::MotionStarted) => v5::MoveStatus::MotionStarted.to_u8(),
+            (_, MoveStatus::Preempted) => v5::MoveStatus::Preempted.to_u8(),
+            (_, MoveStatus::CommandNotPossibleRejected) => v5::MoveStatus::CommandNotPossibleRejected.to_u8(),
+            (_, MoveStatus::InvalidArgumentRejected) => v5::MoveStatus::InvalidArgumentRejected.to_u8(),
+            (_, MoveStatus::ReflexAborted) => v5::MoveStatus::ReflexAborted.to_u8(),
+            _ => v5::MoveStatus::Aborted.to_u8(),
+        }
+    }
+}
+
+/// Where joints are wanted a millisecond later, with rates by joint and place.
+fn after(before: &Wanted, rate: impl Fn(usize, f64) -> f64) -> Wanted {
+    let velocity_rad_s: [f64; N_JOINTS] = std::array::from_fn(|ix| rate(ix, before.position_rad[ix]));
+    Wanted {
+        position_rad: std::array::from_fn(|ix| before.position_rad[ix] + velocity_rad_s[ix] * STEP_SECS),
+        velocity_rad_s,
+        acceleration_rad_s2: std::array::from_fn(|ix| (velocity_rad_s[ix] - before.velocity_rad_s[ix]) / STEP_SECS),
+        is_moving: true,
+    }
+}

@@ -1,0 +1,46 @@
+//! An arm whose joint states come over UDP, for instance from the program that moves it.
+
+use super::counts::Counts;
+use super::whole::WholeReadings;
+use crate::wire::datagram::decode_joints;
+use crate::{Arm, Error};
+use kinematics::JointState;
+use std::net::SocketAddr;
+use std::time::Duration;
+
+/// An arm that is told about.
+#[derive(Debug)]
+pub struct UdpArm {
+    names: Vec<String>,
+    states: WholeReadings,
+}
+
+impl UdpArm {
+    /// Listens for states of these joints; port 0 takes a free one.
+    pub fn open(joint_names: &[String], address: SocketAddr) -> Result<Self, Error> {
+        Ok(Self { names: joint_names.to_vec(), states: WholeReadings::open("arm", "joint states", address)? })
+    }
+
+    /// Where it listens.
+    pub fn address(&self) -> SocketAddr {
+        self.states.address()
+    }
+
+    /// What became of the datagrams so far.
+    pub fn counts(&self) -> Counts {
+        self.states.counts()
+    }
+}
+
+impl Arm for UdpArm {
+    fn joint_names(&self) -> &[String] {
+        &self.names
+    }
+
+    fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
+        let Self { names, states } = self;
+        let read = states.next(timeout, |bytes| decode_joints(bytes, names).map(|told| (told.head, told)))?;
+        let (stamp, told) = read.ok_or(Error::NoJoints { waited: timeout })?;
+        Ok(JointState { stamp, position: told.position, velocity: told.velocity, effort: told.effort })
+    }
+}

@@ -1,0 +1,188 @@
+//! What a rig with a Franka arm needs of this computer and of the way to the robot; nothing here takes its one place for clients.
+
+use super::{Finding, field};
+use crate::config::{ArmDriver, Rig};
+use std::path::Path;
+use std::process::Command;
+
+/// Franka asks for less between a state and the answer to it.
+const MOST_MILLIS: f64 = 1.0;
+/// Pings, five a second.
+const N_PINGS: &str = "10";
+
+/// Checks kernel, limits and network; nothing where the rig has another arm.
+pub(super) fn franka(rig: Option<&Rig>) -> Vec<Finding> {
+    let Some(arm) = rig.map(|rig| &rig.arm).filter(|arm| arm.driver == ArmDriver::Franka) else { return Vec::new() };
+    let os_release = std::fs::read_to_string("/etc/os-release").unwrap_or_default();
+    let mut findings = vec![kernel(Path::new("/sys"), &os_release), locked_memory(Path::new("/proc"))];
+    if arm.address.is_empty() {
+        let mend = "arm.address = \"172.16.0.2\" in the rig file, or what Desk shows under Settings, Network";
+        findings.push(Finding::fail("robot", "arm.address is missing", mend));
+        return findings;
+    }
+    let host = host_of(&arm.address);
+    let ran = |program: &str, arguments: &[&str]| {
+        let output = Command::new(program).args(arguments).output().ok()?;
+        Some(String::from_utf8_lossy(&output.stdout).into_owned())
+    };
+    findings.extend(ran("ip", &["-o", "route", "get", host]).map(|told| route(Path::new("/sys"), host, &told)));
+    findings.push(match ran("ping", &["-n", "-q", "-i", "0.2", "-W", "1", "-c", N_PINGS, host]) {
+        Some(told) => pings(host, &told),
+        None => {
+            let mend = "sudo apt-get install -y iputils-ping";
+            Finding::warn("robot", format!("whether {host} answers is not known without ping"), mend)
+        }
+    });
+    findings
+}
+
+/// An address without its port; addresses of IPv6 with one stand in brackets.
+fn host_of(address: &str) -> &str {
+    match address.strip_prefix('[').and_then(|rest| rest.split_once(']')) {
+        Some((host, _)) => host,
+        None if address.matches(':').count() == 1 => address.split(':').next().unwrap_or(address),
+        None => address,
+    }
+}
+
+fn kernel(sys: &Path, os_release: &str) -> Finding {
+    let is_realtime = std::fs::read_to_string(sys.join("kernel/realtime")).is_ok_and(|text| text.trim() == "1");
+    if is_realtime {
+        return Finding::ok("kernel", "PREEMPT_RT");
+    }
+    let mend = match os_release.lines().any(|line| line == "ID=ubuntu") {
+        true => "sudo pro enable realtime-kernel, then boot into it",
+        false => "sudo apt-get install -y linux-image-rt-amd64, then boot into it",
+    };
+    Finding::warn("kernel", "without PREEMPT_RT: an arm's states at 1 kHz are read, now and then some ms late", mend)
+}
+
+/// How much memory this user may keep from being swapped out.
+fn locked_memory(proc: &Path) -> Finding {
+    match field(&proc.join("self/limits"), "Max locked memory").as_deref() {
+        None => Finding::ok("memory lock", "the kernel does not tell"),
+        Some("unlimited") => Finding::ok("memory lock", "unlimited"),
+        Some(bytes) => {
+            let says = format!("at most {bytes} bytes may be locked: an arm's thread may wait for the disk");
+            let mend = r#"echo "$USER - memlock unlimited" | sudo tee -a /etc/security/limits.conf, then log in again"#;
+            Finding::warn("memory lock", says, mend)
+        }
+    }
+}
+
+/// The way to the robot, as `ip -o route get` tells it.
+fn route(sys: &Path, host: &str, told: &str) -> Finding {
+    let after = |word: &str| {
+        let mut words = told.split_whitespace().skip_while(|found| *found != word);
+        words.nth(1)
+    };
+    let Some(interface) = after("dev") else {
+        let mend = "sudo ip addr add 172.16.0.1/24 dev INTERFACE   (the one that the robot's cable is in, another host of its network)";
+        return Finding::fail("route", format!("no way leads to {host}"), mend);
+    };
+    if sys.join("class/net").join(interface).join("wireless").exists() {
+        let says = format!("{host} is behind {interface}, a wireless network: states come late and get lost");
+        return Finding::warn("route", says, "put the robot's cable into this computer");
+    }
+    match after("via") {
+        Some(router) => {
+            let says = format!("{host} is behind the router {router} ({interface})");
+            Finding::warn("route", says, "put the robot's cable into this computer, in a network of their own")
+        }
+        None => Finding::ok("route", format!("{host} is on {interface}")),
+    }
+}
+
+/// Whether the robot answers, and how soon, as `ping -q` tells it.
+fn pings(host: &str, told: &str) -> Finding {
+    let loss_percent: Option<f64> =
+        told.split_once("% packet loss").and_then(|(before, _)| before.split_whitespace().last()?.parse().ok());
+    let times = told.split_once("mdev = ").and_then(|(_, times)| times.split_whitespace().next());
+    let times: Option<Vec<f64>> = times.and_then(|times| times.split('/').map(|time| time.parse().ok()).collect());
+    let slow = "a cable without a switch; sudo ethtool -C INTERFACE rx-usecs 0; the governor performance";
+    match (loss_percent, times.as_deref()) {
+        (Some(loss_percent), Some([_, average, longest, ..])) => {
+            let says =
+                format!("{host} answers after {average} ms, at most {longest} ms; {loss_percent} % of pings are lost");
+            if loss_percent > 0.0 || *longest > MOST_MILLIS {
+                return Finding::warn("robot", says, slow);
+            }
+            Finding::ok("robot", says)
+        }
+        _ => {
+            let mend = "look at the cable and the robot's lights; Desk shows its address under Settings, Network";
+            Finding::fail("robot", format!("{host} does not answer"), mend)
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Verdict;
+    use super::*;
+
+    #[test]
+    fn hosts_are_told_from_ports() {
+        for (address, host) in [
+            ("172.16.0.2", "172.16.0.2"),
+            ("172.16.0.2:1338", "172.16.0.2"),
+            ("robot.local", "robot.local"),
+            ("fe80::1", "fe80::1"),
+            ("[fe80::1]:1337", "fe80::1"),
+        ] {
+            assert_eq!(host_of(address), host);
+        }
+    }
+
+    #[test]
+    fn kernels_and_limits_are_told_with_their_remedy() {
+        let folder = tempfile::tempdir().expect("a folder");
+        for (name, text) in
+            [("kernel/realtime", "1\n"), ("self/limits", "Max locked memory  8388608  8388608  bytes\n")]
+        {
+            let path = folder.path().join(name);
+            std::fs::create_dir_all(path.parent().expect("inside the folder")).expect("room on the disk");
+            std::fs::write(path, text).expect("room on the disk");
+        }
+        assert_eq!(kernel(folder.path(), "").verdict, Verdict::Ok);
+        for (os_release, remedy) in [("ID=ubuntu\n", "pro enable"), ("ID=debian\n", "linux-image-rt")] {
+            let finding = kernel(Path::new("/nowhere"), os_release);
+            assert_eq!(finding.verdict, Verdict::Warn);
+            assert!(finding.mend.expect("a remedy").contains(remedy));
+        }
+        let finding = locked_memory(folder.path());
+        assert!(finding.says.contains("8388608") && finding.mend.expect("a remedy").contains("memlock"));
+        std::fs::write(folder.path().join("self/limits"), "Max locked memory  unlimited  unlimited  bytes\n")
+            .expect("ours");
+        assert_eq!(locked_memory(folder.path()).verdict, Verdict::Ok);
+    }
+
+    #[test]
+    fn the_way_to_the_robot_is_judged() {
+        let sys = tempfile::tempdir().expect("a folder");
+        std::fs::create_dir_all(sys.path().join("class/net/wlan0/wireless")).expect("room on the disk");
+        let judged = |told: &str| route(sys.path(), "172.16.0.2", told);
+        let direct = judged("172.16.0.2 dev eth0 src 172.16.0.1 uid 0 \\    cache ");
+        assert_eq!((direct.verdict, direct.says.contains("eth0")), (Verdict::Ok, true));
+        let routed = judged("172.16.0.2 via 10.0.0.1 dev eth0 src 10.0.0.7 uid 0 \\    cache ");
+        assert_eq!((routed.verdict, routed.says.contains("10.0.0.1")), (Verdict::Warn, true));
+        assert!(judged("172.16.0.2 dev wlan0 src 172.16.0.1").says.contains("wireless"));
+        assert_eq!(judged("").verdict, Verdict::Fail);
+    }
+
+    #[test]
+    fn pings_are_judged_by_loss_and_by_the_longest() {
+        let told = |loss: &str, longest: &str| {
+            format!(
+                "PING 172.16.0.2 (172.16.0.2) 56(84) bytes of data.\n\n--- 172.16.0.2 ping statistics ---\n10 packets transmitted, \
+                 10 received, {loss}% packet loss, time 1835ms\nrtt min/avg/max/mdev = 0.101/0.150/{longest}/0.020 ms\n"
+            )
+        };
+        let verdict = |told: &str| pings("172.16.0.2", told).verdict;
+        assert_eq!(verdict(&told("0", "0.300")), Verdict::Ok);
+        assert_eq!(verdict(&told("0", "1.300")), Verdict::Warn);
+        assert_eq!(verdict(&told("10", "0.300")), Verdict::Warn);
+        assert_eq!(verdict("10 packets transmitted, 0 received, 100% packet loss, time 9000ms\n"), Verdict::Fail);
+        assert_eq!(verdict(""), Verdict::Fail);
+    }
+}

@@ -1,0 +1,188 @@
+//! The Franka driver and the controller that we play against what others made of the same protocol: libfranka itself as a client
+//! (`pylibfranka`), and `franka-sim` as a controller. Both come from the Python Package Index into a virtual environment that is made once.
+
+#![cfg(target_os = "linux")]
+
+use drivers::Arm;
+use drivers::franka::played::{Joints, Limits, PlayedRobot, RobotConfig, Wanted};
+use drivers::franka::{ArmConfig, FciVersion, FrankaArm, N_JOINTS};
+use kinematics::{Chain, Transform};
+use std::fs;
+use std::io::Write;
+use std::net::{Ipv4Addr, SocketAddr, TcpListener};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::Mutex;
+use std::time::{Duration, Instant};
+
+/// Set to `demand`, a machine that cannot run these tests fails them; `.ci/run` does.
+const DEMAND: &str = "FIELDRIG_HIL";
+/// For whatever is slow on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(60);
+const URDF: &str = include_str!("../../rigs/robots/panda.urdf");
+const PINS: &str = include_str!("sources.sha256");
+/// Both tests want the machine for themselves.
+static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
+
+#[test]
+fn libfranka_moves_the_played_robot_and_recovers_from_a_reflex() {
+    const REST_RAD: [f64; N_JOINTS] = [0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7];
+    let _alone = ONE_AT_A_TIME.lock();
+    let Some(python) = environment() else { return };
+    // libfranka always connects to port 1337: an address of the loopback network that nobody else has.
+    let [_, _, high, low] = std::process::id().to_be_bytes();
+    let ip = Ipv4Addr::new(127, 37, high, low.clamp(1, 254));
+    let config = RobotConfig {
+        address: (ip, 1337).into(),
+        version: FciVersion::V10,
+        chain: chain("panda_link8"),
+        flange_from_ee: Transform::identity(),
+        limits: Limits::fr3(),
+    };
+    let mut is_first = true;
+    let obey = move |_, wanted: &Wanted| {
+        let position_rad = if std::mem::take(&mut is_first) { REST_RAD } else { wanted.position_rad };
+        Joints { position_rad, velocity_rad_s: wanted.velocity_rad_s, ..Joints::default() }
+    };
+    let played = PlayedRobot::start(config, Box::new(obey)).unwrap();
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/hil/libfranka_client.py");
+    let output = Command::new(python).arg(script).arg(ip.to_string()).output().unwrap();
+    let [told, errors] = [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
+    assert!(output.status.success(), "{told}{errors}");
+    report(&format!("libfranka against the played robot: {told}"));
+    let told: serde_json::Value = serde_json::from_str(&told).unwrap();
+    let number = |key: &str| told[key].as_f64().unwrap();
+    // States that came together are one cycle of the client.
+    assert!(number("cycles") > 0.9 * 2000.0 && number("answered") > 0.99, "{told}");
+    for (ix, by) in told["moved_rad"].as_array().unwrap().iter().enumerate() {
+        let expected = if ix == 3 { 0.2 } else { 0.0 };
+        assert!((by.as_f64().unwrap() - expected).abs() < 1e-6, "{told}");
+    }
+    let stopped = told["stopped"].as_str().unwrap();
+    assert!(stopped.contains("reflex") && stopped.contains("discontinuity"), "{told}");
+    assert!(told["reflex"] == true && told["recovered"] == true && number("cycles_again") > 0.9 * 2000.0, "{told}");
+    drop(played);
+}
+
+#[test]
+fn ten_thousand_states_come_from_somebody_elses_controller() {
+    let _alone = ONE_AT_A_TIME.lock();
+    let Some(python) = environment() else { return };
+    let port = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap().local_addr().unwrap().port();
+    let log = fs::File::create(folder().join("franka-sim.log")).unwrap();
+    let child = Command::new(python)
+        .args(["-m", "franka_sim.run_server", "--no-gripper", "--enforce-comm-constraints", "--enforce-motion-limits"])
+        .args(["--port", &port.to_string()])
+        // Its own model has to be fetched; ours is of primitives, and MuJoCo reads it.
+        .env("FR3_MJCF", Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/robots/panda.urdf"))
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(log)
+        .spawn()
+        .unwrap();
+    let _server = Killed(child);
+    let address = SocketAddr::from((Ipv4Addr::LOCALHOST, port)).to_string();
+    // It tells the pose of its seventh link as that of the flange.
+    let config = |tip| {
+        let chain = chain(tip);
+        ArmConfig { address: address.clone(), joint_names: chain.joint_names().to_vec(), chain }
+    };
+    let until = Instant::now() + PATIENCE;
+    let mut arm = loop {
+        match FrankaArm::open(&config("panda_link7")) {
+            Ok(arm) => break arm,
+            Err(error) => assert!(Instant::now() < until, "{error}"),
+        }
+        std::thread::sleep(Duration::from_millis(200));
+    };
+    let mut last = None;
+    for _ in 0..10_000 {
+        let state = arm.read(PATIENCE).unwrap();
+        assert!(last.is_none_or(|last| state.stamp > last));
+        assert_eq!((state.position.len(), state.velocity.len(), state.effort.len()), (N_JOINTS, N_JOINTS, N_JOINTS));
+        last = Some(state.stamp);
+    }
+    let statistics = arm.statistics();
+    report(&format!("our driver against franka-sim: {statistics}\n"));
+    assert!(statistics.success_frac() > 0.99, "{statistics}");
+    // While it is ours nobody else gets in; and the true flange is 107 mm further.
+    let refused = FrankaArm::open(&config("panda_link7")).unwrap_err().to_string();
+    assert!(refused.contains("one client") && refused.contains("udp"), "{refused}");
+}
+
+fn chain(tip: &str) -> Chain {
+    Chain::from_urdf(URDF, "panda_link0", tip).expect("the description comes along")
+}
+
+/// A child that does not outlive the test.
+struct Killed(Child);
+
+impl Drop for Killed {
+    fn drop(&mut self) {
+        // It may have ended by itself.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// Past what the test harness holds back: figures are to be seen when all is well, too.
+fn report(text: &str) {
+    std::io::stderr().write_all(text.as_bytes()).expect("stderr is open");
+}
+
+/// The Python of the virtual environment; `None`, told in a line, where it cannot be made.
+fn environment() -> Option<PathBuf> {
+    if let Err(why) = make_environment() {
+        assert!(!std::env::var(DEMAND).is_ok_and(|value| value == "demand"), "{DEMAND}=demand, but {why}");
+        report(&format!("skipped: {why}\n"));
+        return None;
+    }
+    Some(folder().join("bin/python"))
+}
+
+/// Makes the virtual environment where it is not complete.
+fn make_environment() -> Result<(), String> {
+    let (folder, mark) = (folder(), folder().join("complete"));
+    if mark.exists() {
+        return Ok(());
+    }
+    if !cfg!(target_arch = "x86_64") {
+        return Err("the peers of Franka arms are wheels for x86-64".to_owned());
+    }
+    let run = |program: &Path, arguments: &[&str]| {
+        let output = Command::new(program).args(arguments).output();
+        let output = output.map_err(|error| format!("{} does not start: {error}", program.display()))?;
+        let errors = String::from_utf8_lossy(&output.stderr).into_owned();
+        let last = errors.lines().last().unwrap_or_default().to_owned();
+        if output.status.success() { Ok(()) } else { Err(last) }
+    };
+    let is_right = "import sys; sys.exit(sys.version_info[:2] != (3, 11))";
+    run(Path::new("python3"), &["-c", is_right])
+        .map_err(|_| "the peers of Franka arms are wheels for Python 3.11 (Debian 12)".to_owned())?;
+    // What an interrupted run left.
+    let _ = fs::remove_dir_all(&folder);
+    let [at, wanted] = [&folder, &folder.join("wanted.txt")].map(|path| path.display().to_string());
+    run(Path::new("python3"), &["-m", "venv", &at]).map_err(|error| format!("no virtual environment: {error}"))?;
+    let wanted_text: String = pins().map(|[sha256, _, wheel]| format!("{wheel} --hash=sha256:{sha256}\n")).collect();
+    fs::write(&wanted, wanted_text).map_err(|error| error.to_string())?;
+    let pip =
+        ["-m", "pip", "install", "--quiet", "--only-binary=:all:", "--no-deps", "--require-hashes", "-r", &wanted];
+    run(&folder.join("bin/python"), &pip).map_err(|error| format!("PyPI gives no peers of Franka arms: {error}"))?;
+    fs::write(mark, "").map_err(|error| error.to_string())
+}
+
+/// Named by what is in it, beside the other virtual hardware in the target folder.
+fn folder() -> PathBuf {
+    let shas: String = pins().map(|[sha256, ..]| &sha256[..4]).collect();
+    Path::new(env!("CARGO_TARGET_TMPDIR")).join("../hil").join(format!("franka-{shas}"))
+}
+
+/// The wheels: sha256, file, requirement.
+fn pins() -> impl Iterator<Item = [&'static str; 3]> {
+    let columns = |line: &'static str| {
+        let columns: Vec<&str> = line.split_whitespace().collect();
+        <[&str; 3]>::try_from(columns).ok()
+    };
+    let lines = PINS.lines().filter(|line| !line.starts_with('#')).filter_map(columns);
+    lines.filter(|[_, _, requirement]| requirement.contains("=="))
+}
