@@ -82,12 +82,12 @@ pub enum Error {
         command: String,
     },
     /// A CAN interface could not be read or written, or does not exist.
-    #[error("CAN interface {interface:?}: {source}")]
+    #[error("CAN interface {interface:?}: {reason}")]
     CanBus {
         /// Name of the interface.
         interface: String,
         /// What the system said.
-        source: std::io::Error,
+        reason: std::io::Error,
     },
     /// A motor does not answer, or not as it should.
     #[error("joint {joint:?} on {interface:?}: {reason}")]

@@ -7,7 +7,7 @@ mod simulated;
 mod simulated_tests;
 
 use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Override, Parent, Rig, ScannerDriver};
-use anyhow::{Context, bail};
+use anyhow::{Context, anyhow, bail};
 use drivers::recording::{About, RIG_FILE, Recorder, Recording, URDF_FILE};
 use drivers::{Error, Live, Sample, Source};
 use kinematics::Chain;
@@ -51,7 +51,7 @@ pub(crate) fn rig(mut rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
         bail!("{device} cannot be opened by this version; {WAY_OUT}");
     }
     check_arm(&rig)?;
-    let real = real::open(&rig).context(WAY_OUT)?;
+    let real = real::open(&rig).map_err(|error| anyhow!("{error:#}; {WAY_OUT}"))?;
     let source = if is_any_simulated(&rig) { simulate(&rig, real)? } else { Box::new(Live::new(real)?) };
     Ok(Opened { rig, source, damage: Arc::default() })
 }

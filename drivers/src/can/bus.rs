@@ -92,7 +92,7 @@ impl Bus {
             socket.set_nonblocking(true)?;
             Ok(socket)
         });
-        let socket = open.map_err(|source| Error::CanBus { interface: config.interface.clone(), source })?;
+        let socket = open.map_err(|reason| Error::CanBus { interface: config.interface.clone(), reason })?;
         Ok(Self { config: config.clone(), socket, busy_nanos: AtomicU64::new(0) })
     }
 
@@ -176,8 +176,8 @@ impl Bus {
         self.busy_nanos.fetch_add(nanos, Ordering::Relaxed);
     }
 
-    fn refused(&self, source: io::Error) -> Error {
-        Error::CanBus { interface: self.config.interface.clone(), source }
+    fn refused(&self, reason: io::Error) -> Error {
+        Error::CanBus { interface: self.config.interface.clone(), reason }
     }
 }
 

@@ -59,11 +59,11 @@ impl Link {
     pub fn read(interface: &str) -> Result<Self, Error> {
         let details = CanInterface::open(interface).and_then(|open| open.details());
         details.map(|details| Self::of(interface, &details)).map_err(|error| {
-            let source = match told(error) {
-                source if source.raw_os_error() == Some(ENODEV) => missing(),
-                source => source,
+            let reason = match told(error) {
+                error if error.raw_os_error() == Some(ENODEV) => missing(),
+                error => error,
             };
-            Error::CanBus { interface: interface.to_owned(), source }
+            Error::CanBus { interface: interface.to_owned(), reason }
         })
     }
 
