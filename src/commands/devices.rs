@@ -6,8 +6,6 @@ use drivers::v4l2;
 use serde::Serialize;
 use std::path::Path;
 
-/// `ARPHRD_CAN` of Linux's `if_arp.h`: the kind of a CAN interface in sysfs.
-const CAN_INTERFACE_KIND: &str = "280";
 /// Intel's USB vendor number; RealSense cameras carry it.
 const INTEL_USB_VENDOR: &str = "8086";
 
@@ -117,12 +115,11 @@ fn realsense_cameras(sys: &Path) -> Vec<Found> {
 
 /// CAN interfaces, real and virtual.
 fn can_interfaces(sys: &Path) -> Vec<Found> {
-    let net = sys.join("class/net");
-    children(&net)
+    drivers::can::interfaces(sys)
         .into_iter()
-        .filter(|interface| attribute(&net.join(interface).join("type")).as_deref() == Some(CAN_INTERFACE_KIND))
         .map(|interface| {
-            let state = attribute(&net.join(&interface).join("operstate")).unwrap_or_else(|| "unknown".into());
+            let state = attribute(&sys.join("class/net").join(&interface).join("operstate"))
+                .unwrap_or_else(|| "unknown".into());
             let note = format!("driver can, [arm.bus.{interface}]; `fieldrig doctor` tells how it is set up");
             let usable = cfg!(target_os = "linux");
             Found { kind: "can", address: interface, name: format!("CAN interface, {state}"), usable, note }

@@ -264,7 +264,8 @@ fn usb(camera: &v4l2::Found) -> Option<Finding> {
 fn can(rig: Option<&Rig>) -> Vec<Finding> {
     use drivers::can::{BusConfig, Link, interfaces};
     let named = rig.map_or(&[][..], |rig| &rig.arm.buses);
-    let others = interfaces().into_iter().filter(|name| !named.iter().any(|bus| bus.interface == *name));
+    let others =
+        interfaces(Path::new("/sys")).into_iter().filter(|name| !named.iter().any(|bus| bus.interface == *name));
     let mut findings = Vec::new();
     for (interface, bus) in
         named.iter().map(|bus| (bus.interface.clone(), Some(bus))).chain(others.map(|name| (name, None)))

@@ -1,10 +1,12 @@
 //! How a CAN interface is set up, what is wrong with that, and the command that mends it.
 
 use super::config::BusConfig;
+use super::interfaces::interfaces;
 use crate::Error;
 use socketcan::CanInterface;
 use socketcan::nl::{CanState, InterfaceDetails, Mtu};
 use std::io;
+use std::path::Path;
 
 /// How long a controller that went off the bus waits before it tries again, as we have it set up, milliseconds.
 const RESTART_MILLIS: u32 = 100;
@@ -178,21 +180,8 @@ fn set_up(interface: &str, is_virtual: bool, wanted: &BusConfig) -> String {
 /// The system's number for "no such device".
 const ENODEV: i32 = 19;
 
-/// Names of this machine's CAN interfaces, virtual ones too, in order.
-pub fn interfaces() -> Vec<String> {
-    // ARPHRD_CAN of `linux/if_arp.h`.
-    let is_can = |name: &String| {
-        std::fs::read_to_string(format!("/sys/class/net/{name}/type")).is_ok_and(|kind| kind.trim() == "280")
-    };
-    let all = std::fs::read_dir("/sys/class/net").into_iter().flatten();
-    let mut names: Vec<String> =
-        all.filter_map(|entry| entry.ok()?.file_name().into_string().ok()).filter(is_can).collect();
-    names.sort();
-    names
-}
-
 fn missing() -> io::Error {
-    let others = match interfaces().as_slice() {
+    let others = match interfaces(Path::new("/sys")).as_slice() {
         [] => "this machine has none; is the adapter plugged in, and its driver loaded?".to_owned(),
         names => format!("there is {}", names.join(", ")),
     };

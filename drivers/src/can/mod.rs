@@ -8,6 +8,7 @@ mod arm;
 #[cfg(target_os = "linux")]
 mod bus;
 mod config;
+mod interfaces;
 #[cfg(target_os = "linux")]
 mod link;
 #[cfg(target_os = "linux")]
@@ -19,8 +20,9 @@ pub use arm::CanArm;
 #[cfg(target_os = "linux")]
 pub use bus::{Arrived, Bus, WireErrors};
 pub use config::{ArmConfig, BusConfig, Family, MotorConfig};
+pub use interfaces::interfaces;
 #[cfg(target_os = "linux")]
-pub use link::{Complaint, Link, State, interfaces};
+pub use link::{Complaint, Link, State};
 
 /// Our number among Robstride hosts, as in the maker's program.
 const ROBSTRIDE_HOST: u8 = 0xFD;

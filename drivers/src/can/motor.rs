@@ -183,14 +183,9 @@ impl Motor {
     }
 }
 
-/// Whether a Damiao motor's frame is about a register: it repeats the motor's number and what was asked, which feedback could
-/// also do; but nothing about registers is asked once a motor is set up.
+/// Whether a Damiao motor's frame is about a register: an answer that came too late for its question is no feedback.
 fn is_register(frame: &Frame, motor: u16) -> bool {
-    let is_answer = |message: RegisterMessage| message.motor == motor;
-    frame.data().get(2).is_some_and(|code| matches!(code, 0x33 | 0x55))
-        && frame.data().first() == Some(&motor.to_le_bytes()[0])
-        && frame.data().get(1) == Some(&motor.to_le_bytes()[1])
-        && damiao::decode_register(frame).is_ok_and(is_answer)
+    damiao::decode_register(frame).is_ok_and(|message| message.motor == motor)
 }
 
 /// A conversation with one motor while nothing else reads the bus.
