@@ -10,6 +10,7 @@ mod error;
 pub mod franka;
 pub mod jpeg;
 mod live;
+pub mod motion;
 pub mod recording;
 mod sample;
 pub mod udp;
@@ -19,6 +20,7 @@ mod yuv;
 
 pub use error::{Error, Kept};
 pub use live::{Devices, Live};
+pub use motion::MovableArm;
 pub use sample::{BasePose, Image, PixelFormat, RangePoint, RangeScan, Sample, TruthImage};
 pub use yuv::{V4l2Colors, YuvColors, YuvLayout, YuvMatrix, YuvRange};
 

@@ -1,0 +1,236 @@
+//! Setpoints on the way to a target, from any motion, limited in speed, acceleration and jerk.
+//!
+//! Source: Berscheid and Kröger 2021, "Jerk-limited Real-time Trajectory Generation with Arbitrary Target States"; the maths is that
+//! of the crate `rsruckig`.
+
+use super::{JointTarget, MotionLimits};
+use rsruckig::prelude::{
+    ControlInterface, DataArrayOrVec, InputParameter, OutputParameter, Ruckig, RuckigError, RuckigResult,
+    ThrowErrorHandler,
+};
+use std::time::Duration;
+
+/// How far outside its range a joint may be found, radians or metres: by play, or by an encoder's offset.
+const MAX_OUTSIDE: f64 = 0.02;
+
+/// Where joints are to be at an instant, in their order; radians or metres, and seconds.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Setpoint {
+    /// Positions.
+    pub position: Vec<f64>,
+    /// Velocities.
+    pub velocity: Vec<f64>,
+    /// Accelerations.
+    pub acceleration: Vec<f64>,
+}
+
+/// Makes a setpoint a cycle. All joints arrive at the same time.
+pub struct Generator {
+    ruckig: Ruckig<0, ThrowErrorHandler>,
+    input: InputParameter<0>,
+    output: OutputParameter<0>,
+    limits: Vec<MotionLimits>,
+    is_held: bool,
+}
+
+impl std::fmt::Debug for Generator {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Generator")
+            .field("limits", &self.limits)
+            .field("is_held", &self.is_held)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Generator {
+    /// At rest at `position`; a joint a little outside its range may stay there and come back.
+    ///
+    /// A joint far outside its range, a limit that is not above 0 and finite, and numbers of other arms are told as reasons.
+    pub fn new(limits: &[MotionLimits], position: &[f64], period: Duration) -> Result<Self, String> {
+        let n = limits.len();
+        check(position, n)?;
+        let mut limits = limits.to_vec();
+        for (ix, (joint, position)) in limits.iter_mut().zip(position).enumerate() {
+            let [lower, upper] = joint.position;
+            if !(lower - MAX_OUTSIDE..=upper + MAX_OUTSIDE).contains(position) {
+                return Err(format!(
+                    "joint {} is at {position:.4}, outside its range of {lower:.4} to {upper:.4}",
+                    ix + 1
+                ));
+            }
+            if [joint.velocity, joint.acceleration, joint.jerk].iter().any(|limit| !limit.is_finite() || *limit <= 0.0)
+            {
+                return Err(format!("the limits of joint {} are not all above 0 and finite: {joint:?}", ix + 1));
+            }
+            joint.position = [lower.min(*position), upper.max(*position)];
+        }
+        let each = |of: fn(&MotionLimits) -> f64| list(limits.iter().map(of));
+        let mut input = InputParameter::new(Some(n));
+        input.current_position = list(position.iter().copied());
+        input.target_position = list(position.iter().copied());
+        input.max_velocity = each(|joint| joint.velocity);
+        input.max_acceleration = each(|joint| joint.acceleration);
+        input.max_jerk = each(|joint| joint.jerk);
+        input.min_position = Some(each(|joint| joint.position[0]));
+        input.max_position = Some(each(|joint| joint.position[1]));
+        let ruckig = Ruckig::new(Some(n), period.as_secs_f64());
+        Ok(Self { ruckig, input, output: OutputParameter::new(Some(n)), limits, is_held: true })
+    }
+
+    /// Heads for a target, brought into the joints' ranges, which is returned; one of another arm or not of numbers changes nothing.
+    pub fn head_for(&mut self, target: &JointTarget) -> Result<JointTarget, String> {
+        check(&target.position, self.limits.len())?;
+        let into_range =
+            |(position, joint): (&f64, &MotionLimits)| position.clamp(joint.position[0], joint.position[1]);
+        let position: Vec<f64> = target.position.iter().zip(&self.limits).map(into_range).collect();
+        self.input.control_interface = ControlInterface::Position;
+        self.input.target_position = list(position.iter().copied());
+        self.is_held = false;
+        Ok(JointTarget { position })
+    }
+
+    /// Comes to rest as soon as the limits allow.
+    pub fn stop(&mut self) {
+        if !self.is_held {
+            self.input.control_interface = ControlInterface::Velocity;
+        }
+    }
+
+    /// Whether it is at rest where it was headed for.
+    pub fn is_held(&self) -> bool {
+        self.is_held
+    }
+
+    /// Where the joints are to be a cycle later.
+    pub fn step(&mut self) -> Result<Setpoint, String> {
+        if !self.is_held {
+            let result = self.ruckig.update(&self.input, &mut self.output).map_err(told)?;
+            self.output.pass_to_input(&mut self.input);
+            if result == RuckigResult::Finished {
+                self.is_held = true;
+                // The end of a way is met to within a rounding error, and no motion is left.
+                self.input.current_velocity = list(self.limits.iter().map(|_| 0.0));
+                self.input.current_acceleration = list(self.limits.iter().map(|_| 0.0));
+            }
+        }
+        let numbers = |list: &DataArrayOrVec<f64, 0>| list.iter().copied().collect();
+        Ok(Setpoint {
+            position: numbers(&self.input.current_position),
+            velocity: numbers(&self.input.current_velocity),
+            acceleration: numbers(&self.input.current_acceleration),
+        })
+    }
+}
+
+/// One number a joint, all of them numbers.
+fn check(position: &[f64], n: usize) -> Result<(), String> {
+    if position.len() != n {
+        return Err(format!("{} positions are given for {n} joints", position.len()));
+    }
+    match position.iter().position(|position| !position.is_finite()) {
+        Some(ix) => Err(format!("the position of joint {} is no number: {}", ix + 1, position[ix])),
+        None => Ok(()),
+    }
+}
+
+fn list(numbers: impl Iterator<Item = f64>) -> DataArrayOrVec<f64, 0> {
+    DataArrayOrVec::Heap(numbers.collect())
+}
+
+fn told(error: RuckigError) -> String {
+    format!("no way to the target was found: {error}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PERIOD: Duration = Duration::from_millis(1);
+
+    fn limits() -> Vec<MotionLimits> {
+        let joint = |position, velocity| MotionLimits { position, velocity, acceleration: 2.0, jerk: 20.0 };
+        vec![joint([-1.0, 1.0], 0.5), joint([f64::NEG_INFINITY, f64::INFINITY], 0.3)]
+    }
+
+    fn at_rest() -> Generator {
+        Generator::new(&limits(), &[0.0, 0.2], PERIOD).unwrap()
+    }
+
+    /// Steps until it is held, and checks every limit by differences from cycle to cycle.
+    fn follow(generator: &mut Generator) -> Vec<Setpoint> {
+        let secs = PERIOD.as_secs_f64();
+        let mut way = vec![generator.step().unwrap()];
+        while !generator.is_held() {
+            way.push(generator.step().unwrap());
+            assert!(way.len() < 20_000, "it never arrives");
+        }
+        for pair in way.windows(2) {
+            for (ix, joint) in limits().iter().enumerate() {
+                let speed = (pair[1].position[ix] - pair[0].position[ix]) / secs;
+                let acceleration = (pair[1].velocity[ix] - pair[0].velocity[ix]) / secs;
+                let jerk = (pair[1].acceleration[ix] - pair[0].acceleration[ix]) / secs;
+                assert!(speed.abs() <= joint.velocity * 1.0001, "{speed}");
+                assert!(acceleration.abs() <= joint.acceleration * 1.0001, "{acceleration}");
+                assert!(jerk.abs() <= joint.jerk * 1.0001, "{jerk}");
+                assert!((joint.position[0]..=joint.position[1]).contains(&pair[1].position[ix]));
+            }
+        }
+        way
+    }
+
+    #[test]
+    fn all_joints_arrive_together_within_their_limits() {
+        let mut generator = at_rest();
+        let target = JointTarget { position: vec![0.9, -0.1] };
+        assert_eq!(generator.head_for(&target).unwrap(), target);
+        let way = follow(&mut generator);
+        let last = way.last().unwrap();
+        assert!(last.position.iter().zip(&target.position).all(|(got, wanted)| (got - wanted).abs() < 1e-9));
+        assert_eq!(last.velocity, [0.0, 0.0]);
+        let before = &way[way.len() - 20];
+        assert!(
+            (0..2).all(|ix| (before.position[ix] - target.position[ix]).abs() > 1e-9),
+            "both are still on their way"
+        );
+    }
+
+    #[test]
+    fn a_target_on_the_way_and_a_stop_keep_the_limits() {
+        let mut generator = at_rest();
+        generator.head_for(&JointTarget { position: vec![0.9, -5.0] }).unwrap();
+        for _ in 0..300 {
+            generator.step().unwrap();
+        }
+        generator.head_for(&JointTarget { position: vec![-0.9, 5.0] }).unwrap();
+        for _ in 0..400 {
+            generator.step().unwrap();
+        }
+        generator.stop();
+        let way = follow(&mut generator);
+        let last = way.last().unwrap();
+        assert_eq!(last.velocity, [0.0, 0.0]);
+        assert!(last.position[0] > -0.9, "it did not go on to its target");
+        assert_eq!(generator.step().unwrap(), *last, "it stays");
+    }
+
+    #[test]
+    fn targets_outside_the_range_are_brought_into_it_and_others_are_refused() {
+        let mut generator = at_rest();
+        let taken = generator.head_for(&JointTarget { position: vec![3.0, 7.0] }).unwrap();
+        assert_eq!(taken.position, [1.0, 7.0]);
+        let before = generator.step().unwrap();
+        assert!(generator.head_for(&JointTarget { position: vec![0.0] }).unwrap_err().contains("1 positions"));
+        assert!(generator.head_for(&JointTarget { position: vec![f64::NAN, 0.0] }).unwrap_err().contains("joint 1"));
+        assert!(generator.step().unwrap().position[1] > before.position[1], "it is on its way as before");
+    }
+
+    #[test]
+    fn a_joint_may_begin_a_little_outside_its_range_but_not_far() {
+        let mut generator = Generator::new(&limits(), &[1.01, 0.0], PERIOD).unwrap();
+        generator.head_for(&JointTarget { position: vec![0.5, 0.0] }).unwrap();
+        while !generator.is_held() {
+            generator.step().unwrap();
+        }
+        assert!(Generator::new(&limits(), &[1.5, 0.0], PERIOD).unwrap_err().contains("joint 1 is at 1.5"));
+    }
+}
