@@ -1,6 +1,6 @@
 //! The commands and what `--help` says of them; each command's flags stand at the head of its own file.
 
-use crate::commands::{bench, devices, doctor, eval, export, fk, metrics, record, render, run, train};
+use crate::commands::{bench, devices, doctor, eval, export, fk, metrics, record, render, run, sim, train};
 use clap::{ArgAction, Parser, Subcommand};
 
 /// Turns a robot's cameras and joints into a live radiance field.
@@ -48,4 +48,6 @@ pub(crate) enum Command {
     Devices(devices::Args),
     /// Check GPU, clocks, memory and permissions, and name the line that mends what is amiss
     Doctor(doctor::Args),
+    /// Play a rig's devices on the wire: a robot's controller, motors on CAN buses, datagrams, recordings of cameras
+    Sim(sim::Args),
 }

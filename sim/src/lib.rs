@@ -32,6 +32,7 @@ mod scene;
 pub mod tag;
 mod texture;
 mod toy;
+pub mod wire;
 
 /// Where things are in the scenes, for whoever checks pictures and scans of them.
 pub mod layout {

@@ -10,6 +10,7 @@ pub(crate) mod metrics;
 pub(crate) mod record;
 pub(crate) mod render;
 pub(crate) mod run;
+pub(crate) mod sim;
 pub(crate) mod train;
 
 use crate::cli::Command;
@@ -31,6 +32,7 @@ pub(crate) fn run(command: Command) -> anyhow::Result<Exit> {
         Command::Bench(args) => bench::run(&args),
         Command::Devices(args) => devices::run(&args),
         Command::Doctor(args) => doctor::run(&args),
+        Command::Sim(args) => sim::run(&args),
     }
 }
 

@@ -6,6 +6,9 @@ mod simulated;
 #[cfg(all(test, feature = "sim"))]
 mod simulated_tests;
 
+#[cfg(all(feature = "sim", target_os = "linux"))]
+pub(crate) use real::{franka_chain, udp_arm_address};
+
 use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Override, Parent, Rig, ScannerDriver};
 use anyhow::{Context, anyhow, bail};
 use drivers::recording::{About, RIG_FILE, Recorder, Recording, URDF_FILE};

@@ -63,14 +63,21 @@ fn franka_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
     if arm.address.is_empty() {
         bail!("arm.address is missing: that of the robot's controller, for instance \"172.16.0.2\"");
     }
-    let robot = kinematics::urdf::Robot::parse(&arm.urdf_text).context("the arm's URDF")?;
-    let path = robot.path(&arm.base_link, &arm.flange_link).context("the arm's URDF")?;
-    // The robot tells poses in the link that its first joint turns against, wherever on the base that is.
-    let first = path.iter().find(|joint| arm.joints.contains(&joint.name));
-    let foot_link = first.map_or(&arm.base_link, |joint| &joint.parent);
-    let chain = kinematics::Chain::new(&robot, foot_link, &arm.flange_link).context("the arm's URDF")?;
+    let chain = franka_chain(rig)?;
     let config = franka::ArmConfig { address: arm.address.clone(), joint_names: arm.joints.clone(), chain };
     Ok(Box::new(FrankaArm::open(&config)?))
+}
+
+/// From the link in which a Franka arm tells poses to its flange.
+#[cfg(target_os = "linux")]
+pub(crate) fn franka_chain(rig: &Rig) -> anyhow::Result<kinematics::Chain> {
+    let Rig { arm, .. } = rig;
+    let robot = kinematics::urdf::Robot::parse(&arm.urdf_text).context("the arm's URDF")?;
+    let path = robot.path(&arm.base_link, &arm.flange_link).context("the arm's URDF")?;
+    // That is the one that its first joint turns against, wherever on the base that is.
+    let first = path.iter().find(|joint| arm.joints.contains(&joint.name));
+    let foot_link = first.map_or(&arm.base_link, |joint| &joint.parent);
+    kinematics::Chain::new(&robot, foot_link, &arm.flange_link).context("the arm's URDF")
 }
 
 #[cfg(not(target_os = "linux"))]
@@ -80,16 +87,19 @@ fn franka_arm(_rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
 
 /// An arm that another program tells about.
 fn udp_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
-    let Rig { arm, .. } = rig;
-    let address = match &*arm.address {
-        "" => USUAL_ARM_ADDRESS,
-        text => text.parse().with_context(|| {
-            format!("arm.address is {text:?}: with the driver udp it is where to listen, like {USUAL_ARM_ADDRESS}")
-        })?,
-    };
-    let open = UdpArm::open(&arm.joints, address)?;
+    let open = UdpArm::open(&rig.arm.joints, udp_arm_address(rig)?)?;
     log::info!("arm: listening on {}", open.address());
     Ok(Box::new(open))
+}
+
+/// Where its joint states are listened for.
+pub(crate) fn udp_arm_address(rig: &Rig) -> anyhow::Result<SocketAddr> {
+    match &*rig.arm.address {
+        "" => Ok(USUAL_ARM_ADDRESS),
+        text => text.parse().with_context(|| {
+            format!("arm.address is {text:?}: with the driver udp it is where to listen, like {USUAL_ARM_ADDRESS}")
+        }),
+    }
 }
 
 /// The color images of a camera.

@@ -1,0 +1,233 @@
+//! From a rig file to its devices on the wire.
+
+use super::Args;
+use crate::config::{ArmDriver, BaseDriver, Rig, ScannerDriver};
+use crate::exit::{BadArgument, Exit};
+use crate::open::{self, Devices};
+use crate::print;
+use crate::stop::Stop;
+use anyhow::{Context, bail};
+use drivers::franka::FciVersion;
+use drivers::franka::played::{Limits, PlayedRobot, RobotConfig};
+use drivers::{can, clock};
+use kinematics::{Stamp, Transform};
+use serde::Serialize;
+use sim::wire::{Clockwork, JointTrack, Listeners, PlayedMotors, PlayedSenders, Script, play_fci};
+use std::net::{SocketAddr, ToSocketAddrs};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+/// The port of FCI.
+const FCI_PORT: u16 = 1337;
+/// How soon Ctrl-C is noticed.
+const POLL: Duration = Duration::from_millis(50);
+
+/// The scenes that bring a rig file whose devices are on the wire.
+const SCENES: [(&str, &str, &str); 2] = [
+    ("static-arm", include_str!("../../../rigs/wire/static-arm.toml"), include_str!("../../../rigs/robots/panda.urdf")),
+    (
+        "mobile-arm",
+        include_str!("../../../rigs/wire/mobile-arm.toml"),
+        include_str!("../../../rigs/robots/mobile-arm.urdf"),
+    ),
+];
+
+/// What is told once all is ready.
+#[derive(Debug, Serialize)]
+struct Ready<'a> {
+    event: &'static str,
+    /// The rig file to run against.
+    rig: &'a Path,
+    /// Until playing begins, and how long it goes on.
+    starts_in_secs: f64,
+    seconds: f64,
+    playing: &'a [String],
+}
+
+pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let stop = Stop::on_ctrl_c()?;
+    let (name, rig) = load(&args.what)?;
+    check(&rig)?;
+    let folder = args.out.clone().unwrap_or_else(|| PathBuf::from(format!("sim-{name}")));
+    std::fs::create_dir_all(&folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
+    let Some(script) = script(args, &rig, &stop)? else { return Ok(Exit::Done) };
+    let first = script.joints.first().map(|state| state.stamp);
+    let first = first.or(script.poses.first().map(|pose| pose.stamp)).unwrap_or_default();
+    let clockwork = Clockwork { scripted: first, played: clock::now().plus_secs(args.start_in) };
+    let rig_file = write_rig(&folder, &rig)?;
+    let played = Played::start(&rig, &script, clockwork, args)?;
+    if args.json {
+        let (starts_in_secs, seconds) = (args.start_in, args.seconds);
+        print::json(&Ready { event: "ready", rig: &rig_file, starts_in_secs, seconds, playing: &played.told })?;
+    } else {
+        for device in &played.told {
+            print::line(device)?;
+        }
+        print::line(format_args!(
+            "Playing {:.1} s, which begins in {:.1} s. In another terminal: fieldrig run {}",
+            args.seconds,
+            args.start_in,
+            rig_file.display()
+        ))?;
+    }
+    wait(&stop, clockwork.played, args)?;
+    Ok(Exit::Done)
+}
+
+/// The rig and what it is called.
+fn load(what: &str) -> anyhow::Result<(String, Rig)> {
+    if let Some((name, text, urdf)) = SCENES.iter().find(|(name, ..)| *name == what) {
+        return Ok(((*name).to_owned(), Rig::parse(name, text, urdf, &[])?));
+    }
+    let path = Path::new(what);
+    if !path.exists() {
+        let scenes: Vec<_> = SCENES.iter().map(|(name, ..)| *name).collect();
+        return Err(BadArgument(format!("there is no rig file {what:?}; scenes: {}", scenes.join(", "))).into());
+    }
+    let name = path.file_stem().map_or_else(|| "rig".to_owned(), |stem| stem.to_string_lossy().into_owned());
+    Ok((name, Rig::load(path, &[])?))
+}
+
+/// Refuses a rig of which nothing is on the wire.
+fn check(rig: &Rig) -> Result<(), BadArgument> {
+    if rig.arm.driver == ArmDriver::Sim {
+        return Err(BadArgument(
+            "arm.driver is sim: `fieldrig run` plays such an arm itself; on the wire are franka, can and udp"
+                .to_owned(),
+        ));
+    }
+    Ok(())
+}
+
+/// What the devices say; `None` where that was interrupted.
+fn script(args: &Args, rig: &Rig, stop: &Stop) -> anyhow::Result<Option<Script>> {
+    let opened = match &args.from {
+        Some(path) => open::recording(path, None, &[])?,
+        None => {
+            let mut simulated = rig.clone();
+            simulated.sim.lockstep = true;
+            open::rig(simulated, Devices::Sim)?
+        }
+    };
+    let mut source = opened.source;
+    let mut script = Script::default();
+    let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
+    let mut first: Option<Stamp> = None;
+    while let Some(sample) = source.next_sample()? {
+        let secs = sample.stamp().secs_since(*first.get_or_insert(sample.stamp()));
+        if secs > args.seconds {
+            break;
+        }
+        if stop.asked() {
+            return Ok(None);
+        }
+        bar.set_message(format!("{secs:.1} of {:.1} s simulated", args.seconds));
+        script.take(sample);
+    }
+    bar.finish_and_clear();
+    Ok(Some(script))
+}
+
+/// The rig file that runs against what is played, the robot's description beside it.
+fn write_rig(folder: &Path, rig: &Rig) -> anyhow::Result<PathBuf> {
+    let path = folder.join(drivers::recording::RIG_FILE);
+    let urdf = folder.join(drivers::recording::URDF_FILE);
+    for (path, text) in [(&path, &rig.to_toml()), (&urdf, &rig.arm.urdf_text)] {
+        std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    Ok(path)
+}
+
+/// Devices that answer until they are dropped.
+struct Played {
+    _robot: Option<PlayedRobot>,
+    _motors: Option<PlayedMotors>,
+    _senders: PlayedSenders,
+    /// What they are, a sentence each.
+    told: Vec<String>,
+}
+
+impl Played {
+    fn start(rig: &Rig, script: &Script, clockwork: Clockwork, args: &Args) -> anyhow::Result<Self> {
+        let track = || JointTrack::new(&script.joints, clockwork).context("the joints' readings");
+        let (mut robot, mut motors) = (None, None);
+        let mut listeners = Listeners::default();
+        let mut told = Vec::new();
+        match rig.arm.driver {
+            ArmDriver::Franka => {
+                let open = play_fci(track()?, robot_config(rig, &args.fci)?)?;
+                told.push(format!("arm: a Franka controller at {}, FCI {}", open.address(), args.fci));
+                robot = Some(open);
+            }
+            ArmDriver::Can => {
+                let config = can::ArmConfig {
+                    buses: rig.arm.buses.clone(),
+                    motors: rig.arm.motors.clone(),
+                    rate_hz: rig.arm.rate_hz,
+                };
+                motors = Some(PlayedMotors::start(&track()?, &config)?);
+                let buses: Vec<_> = rig.arm.buses.iter().map(|bus| &*bus.interface).collect();
+                told.push(format!("arm: {} motors on {}", rig.arm.motors.len(), buses.join(", ")));
+            }
+            ArmDriver::Udp => {
+                let address = open::udp_arm_address(rig)?;
+                told.push(format!("arm: datagrams to {address}"));
+                listeners.joints = Some((address, rig.arm.joints.clone()));
+            }
+            ArmDriver::None | ArmDriver::Sim => {}
+        }
+        if rig.base.driver == BaseDriver::Udp {
+            told.push(format!("base: datagrams to {}", rig.base.address));
+            listeners.base = Some(rig.base.address);
+        }
+        for scanner in rig.scanners.iter().filter(|scanner| scanner.driver == ScannerDriver::Udp) {
+            told.push(format!("range scanner {:?}: datagrams to {}", scanner.name, scanner.address));
+            listeners.scanners.push((scanner.name.to_string(), scanner.address));
+        }
+        let senders = PlayedSenders::start(script, clockwork, listeners)?;
+        Ok(Self { _robot: robot, _motors: motors, _senders: senders, told })
+    }
+}
+
+/// The controller of a rig's arm.
+fn robot_config(rig: &Rig, fci: &str) -> anyhow::Result<RobotConfig> {
+    let (version, limits) = match fci {
+        "5" => (FciVersion::V5, Limits::panda()),
+        _ => (FciVersion::V10, Limits::fr3()),
+    };
+    let address = fci_address(&rig.arm.address)?;
+    let chain = open::franka_chain(rig)?;
+    Ok(RobotConfig { address, version, chain, flange_from_ee: Transform::identity(), limits })
+}
+
+/// Where a controller listens, which is one of this computer's own addresses.
+fn fci_address(text: &str) -> anyhow::Result<SocketAddr> {
+    let found = match text.parse() {
+        Ok(address) => Some(address),
+        Err(_) => (text, FCI_PORT).to_socket_addrs().ok().and_then(|mut all| all.next()),
+    };
+    match found {
+        Some(address) => Ok(address),
+        None => bail!("arm.address is {text:?}: it has to be an address of this computer, like 127.0.0.1"),
+    }
+}
+
+/// Waits for Ctrl-C; the devices stand still once all was played.
+fn wait(stop: &Stop, begins: Stamp, args: &Args) -> anyhow::Result<()> {
+    let bar = print::bar(None, "{spinner} {msg}", args.json);
+    let mut is_over = false;
+    while !stop.asked() {
+        let secs = clock::now().secs_since(begins);
+        bar.set_message(match secs {
+            ..0.0 => format!("begins in {:.1} s", -secs),
+            _ if secs < args.seconds => format!("{secs:.1} of {:.1} s played", args.seconds),
+            _ => "played to the end; everything stands still until Ctrl-C".to_owned(),
+        });
+        if secs >= args.seconds && !std::mem::replace(&mut is_over, true) && args.json {
+            print::json(&serde_json::json!({ "event": "over" }))?;
+        }
+        std::thread::sleep(POLL);
+    }
+    bar.finish_and_clear();
+    Ok(())
+}
