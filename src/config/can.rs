@@ -2,7 +2,7 @@
 
 use super::section::Section;
 use super::write::{is, name_of, table, whole};
-use drivers::can::{BusConfig, Family, MotorConfig};
+use drivers::can::{BusConfig, Family, Gains, MotorConfig};
 use drivers::wire::can::cia402::Units;
 use drivers::wire::can::{canopen, odrive, robstride, tmotor};
 use toml::{Table, Value};
@@ -102,6 +102,7 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
     let counts_per_turn = is(&[Kind::Cia402]).then(|| keys.number("counts_per_turn", 1.0..=1e12)).flatten();
     let rated_torque_nm = is(&[Kind::Cia402]).then(|| keys.number("rated_torque_nm", 0.0..=1e6)).flatten();
     let rated_torque_nm = rated_torque_nm.unwrap_or(0.0);
+    let gains = is(&[Kind::Damiao, Kind::Robstride, Kind::TMotor]).then(|| gains(&mut keys)).flatten();
     let gear_ratio = keys.number("gear_ratio", GEARS).unwrap_or(1.0);
     let is_reversed = keys.flag("reversed").unwrap_or(false);
     let offset_rad = keys.number("offset_rad", -100.0..=100.0).unwrap_or(0.0);
@@ -144,7 +145,19 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
         }
     };
     keys.end();
-    Some(MotorConfig { joint, bus_ix: bus_ix?, family: family?, gear_ratio, is_reversed, offset_rad })
+    Some(MotorConfig { joint, bus_ix: bus_ix?, family: family?, gear_ratio, is_reversed, offset_rad, gains })
+}
+
+/// Both of them, or none.
+fn gains(keys: &mut Section<'_>) -> Option<Gains> {
+    let stiffness_nm_rad = keys.number("stiffness_nm_rad", 0.0..=1e6);
+    let damping_nm_s_rad = keys.number("damping_nm_s_rad", 0.0..=1e5);
+    match (stiffness_nm_rad, damping_nm_s_rad) {
+        (Some(_), None) => keys.missing("damping_nm_s_rad", "it goes with stiffness_nm_rad"),
+        (None, Some(_)) => keys.missing("stiffness_nm_rad", "it goes with damping_nm_s_rad"),
+        _ => {}
+    }
+    Some(Gains { stiffness_nm_rad: stiffness_nm_rad?, damping_nm_s_rad: damping_nm_s_rad? })
 }
 
 /// The tables of buses and motors; none where there are none.
@@ -198,5 +211,7 @@ fn motor_table(motor: &MotorConfig, bus: &str) -> Table {
         ("gear_ratio", is(motor.gear_ratio)),
         ("reversed", is(motor.is_reversed)),
         ("offset_rad", is(motor.offset_rad)),
+        ("stiffness_nm_rad", motor.gains.and_then(|gains| is(gains.stiffness_nm_rad))),
+        ("damping_nm_s_rad", motor.gains.and_then(|gains| is(gains.damping_nm_s_rad))),
     ])
 }

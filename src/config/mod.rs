@@ -4,6 +4,7 @@
 
 mod can;
 mod error;
+mod motion;
 mod read;
 mod section;
 #[cfg(test)]
@@ -11,6 +12,7 @@ mod tests;
 mod write;
 
 pub(crate) use error::ConfigError;
+pub(crate) use motion::ArmMotion;
 pub(crate) use write::methods;
 
 use crate::method::Kind;
@@ -66,6 +68,8 @@ pub(crate) struct Arm {
     pub(crate) buses: Vec<BusConfig>,
     /// Motors on them, in the order of `joints`.
     pub(crate) motors: Vec<MotorConfig>,
+    /// How it may be moved; `None` where it is only read.
+    pub(crate) motion: Option<ArmMotion>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -308,7 +312,19 @@ impl Rig {
         let file =
             path.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned());
         let folder = path.parent().unwrap_or(Path::new("")).to_owned();
-        read::rig(&file, &text, overrides, |urdf| read_file("the robot's description", &folder.join(urdf)))
+        let mut rig =
+            read::rig(&file, &text, overrides, |urdf| read_file("the robot's description", &folder.join(urdf)))?;
+        if let Some(motion) = rig.arm.motion.as_mut().filter(|motion| !motion.odrive_endpoints.is_empty()) {
+            // Wherever the settled file lies, it names the same file.
+            let path = folder.join(&motion.odrive_endpoints);
+            let path = std::path::absolute(&path).map_err(|source| ConfigError::Read {
+                what: "ODrive's endpoints",
+                path,
+                source,
+            })?;
+            motion.odrive_endpoints = path.to_string_lossy().into_owned();
+        }
+        Ok(rig)
     }
 
     /// Checks the text of a rig file whose robot is described by `urdf_text`; `file` is its name in messages.

@@ -171,6 +171,7 @@ fn arm(mut keys: Section<'_>) -> (Arm, String) {
         rate_hz: keys.number("rate_hz", 1.0..=2000.0).unwrap_or(200.0),
         buses,
         motors,
+        motion: keys.optional_section("motion").and_then(super::motion::read),
     };
     keys.end();
     (arm, urdf.unwrap_or_default())

@@ -45,6 +45,8 @@ family = "damiao"
 bus = "can0"
 id = 1
 feedback_id = 17
+stiffness_nm_rad = 30
+damping_nm_s_rad = 1
 [arm.motor.second]
 family = "robstride"
 bus = "can0"
@@ -55,6 +57,8 @@ family = "cia402"
 bus = "can0"
 id = 3
 counts_per_turn = 65536
+[arm.motion]
+on_loss = "release"
 "#;
 
 fn parse(text: &str, overrides: &[Override]) -> Result<Rig, ConfigError> {
@@ -67,7 +71,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a good value that differs from the one in force, and a value that is not allowed.
-const KEYS: [(&str, &str, &str); 133] = [
+const KEYS: [(&str, &str, &str); 141] = [
     ("arm.rate_hz", "500", "0"),
     ("arm.bus.can0.bitrate_hz", "500_000", "1"),
     ("arm.bus.can0.data_bitrate_hz", "5_000_000", "9_000_000"),
@@ -83,6 +87,14 @@ const KEYS: [(&str, &str, &str); 133] = [
     ("arm.motor.third.gear_ratio", "50", "0"),
     ("arm.motor.third.reversed", "true", "-1"),
     ("arm.motor.third.offset_rad", "-0.5", "'left'"),
+    ("arm.motor.first.stiffness_nm_rad", "60.5", "-1"),
+    ("arm.motor.first.damping_nm_s_rad", "0", "'much'"),
+    ("arm.motion.on_loss", "'hold'", "'panic'"),
+    ("arm.motion.timeout_millis", "50", "0"),
+    ("arm.motion.acceleration_secs", "1", "0"),
+    ("arm.motion.jerk_secs", "0.2", "0"),
+    ("arm.motion.accept_no_watchdog", "true", "1"),
+    ("arm.motion.odrive_endpoints", "'flat_endpoints.json'", "7"),
     ("arm.driver", "'franka'", "'frankka'"),
     ("arm.driver", "'none'", "'nothing'"),
     ("arm.address", "'172.16.0.2'", "7"),

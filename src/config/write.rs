@@ -55,6 +55,7 @@ fn arm(arm: &Arm) -> Table {
         ("rate_hz", is(arm.rate_hz)),
         ("bus", buses),
         ("motor", motors),
+        ("motion", arm.motion.as_ref().map(|motion| Value::Table(super::motion::write(motion)))),
     ])
 }
 

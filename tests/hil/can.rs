@@ -121,7 +121,15 @@ impl Drop for Bench {
 }
 
 fn motor(joint: &str, family: Family) -> MotorConfig {
-    MotorConfig { joint: joint.to_owned(), bus_ix: 0, family, gear_ratio: 1.0, is_reversed: false, offset_rad: 0.0 }
+    MotorConfig {
+        joint: joint.to_owned(),
+        bus_ix: 0,
+        family,
+        gear_ratio: 1.0,
+        is_reversed: false,
+        offset_rad: 0.0,
+        gains: None,
+    }
 }
 
 fn damiao(ix: u16) -> MotorConfig {

@@ -288,8 +288,15 @@ mod tests {
             .map(|ix| {
                 let family = Family::Damiao { motor: ix + 1, feedback: 0x10 + ix };
                 let joint = format!("joint{ix}");
-                let config =
-                    MotorConfig { joint, bus_ix: 0, family, gear_ratio: 1.0, is_reversed: false, offset_rad: 0.0 };
+                let config = MotorConfig {
+                    joint,
+                    bus_ix: 0,
+                    family,
+                    gear_ratio: 1.0,
+                    is_reversed: false,
+                    offset_rad: 0.0,
+                    gains: None,
+                };
                 (usize::from(ix), Motor::with_limits(config, crate::wire::can::mit::Limits::of(12.5, 30.0, 10.0)))
             })
             .collect();

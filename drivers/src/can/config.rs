@@ -86,4 +86,15 @@ pub struct MotorConfig {
     pub is_reversed: bool,
     /// Angle of the joint where the motor tells 0, rad.
     pub offset_rad: f64,
+    /// How it is held where each command carries that, in MIT mode; `None` where it is only read.
+    pub gains: Option<Gains>,
+}
+
+/// How stiffly a joint is held. The motor in front of a gear gets both divided by the square of the ratio.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Gains {
+    /// Torque by how far it is from where it shall be, N m / rad of the joint.
+    pub stiffness_nm_rad: f64,
+    /// Torque by how much slower it is than it shall be, N m s / rad of the joint.
+    pub damping_nm_s_rad: f64,
 }

@@ -19,7 +19,7 @@ pub mod played;
 pub use arm::CanArm;
 #[cfg(target_os = "linux")]
 pub use bus::{Arrived, Bus, WireErrors};
-pub use config::{ArmConfig, BusConfig, Family, MotorConfig};
+pub use config::{ArmConfig, BusConfig, Family, Gains, MotorConfig};
 pub use interfaces::interfaces;
 #[cfg(target_os = "linux")]
 pub use link::{Complaint, Link, State};

@@ -1,0 +1,57 @@
+//! The keys of how an arm may be moved: `[arm.motion]`.
+
+use super::section::Section;
+use super::write::{is, name_of, table};
+use drivers::motion::OnLoss;
+use toml::Table;
+
+/// How an arm may be moved; an arm without this table is only read.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct ArmMotion {
+    /// What its motors do when this computer falls silent.
+    pub(crate) on_loss: OnLoss,
+    /// After how long a silence.
+    pub(crate) timeout_millis: f64,
+    /// From rest to `arm.max_speed_rad_s` at full acceleration.
+    pub(crate) acceleration_secs: f64,
+    /// From rest to full acceleration.
+    pub(crate) jerk_secs: f64,
+    /// Whether motors that do not notice the silence are moved all the same.
+    pub(crate) accept_no_watchdog: bool,
+    /// Path of `ODrive`'s `flat_endpoints.json`; empty where there is none.
+    pub(crate) odrive_endpoints: String,
+}
+
+const ON_LOSS: [(&str, OnLoss); 3] = [("hold", OnLoss::Hold), ("damp", OnLoss::Damp), ("release", OnLoss::Release)];
+
+pub(super) fn read(mut keys: Section<'_>) -> Option<ArmMotion> {
+    let on_loss = keys.choice("on_loss", &ON_LOSS);
+    if on_loss.is_none() {
+        keys.missing("on_loss", "hold, damp or release: what the motors do when this computer falls silent");
+    }
+    let timeout_millis = keys.number("timeout_millis", 5.0..=2000.0).unwrap_or(100.0);
+    let acceleration_secs = keys.number("acceleration_secs", 0.01..=10.0).unwrap_or(0.5);
+    let jerk_secs = keys.number("jerk_secs", 0.001..=10.0).unwrap_or(0.1);
+    let accept_no_watchdog = keys.flag("accept_no_watchdog").unwrap_or(false);
+    let odrive_endpoints = keys.text("odrive_endpoints").unwrap_or_default();
+    keys.end();
+    Some(ArmMotion {
+        on_loss: on_loss?,
+        timeout_millis,
+        acceleration_secs,
+        jerk_secs,
+        accept_no_watchdog,
+        odrive_endpoints,
+    })
+}
+
+pub(super) fn write(motion: &ArmMotion) -> Table {
+    table([
+        ("on_loss", name_of(&ON_LOSS, &motion.on_loss)),
+        ("timeout_millis", is(motion.timeout_millis)),
+        ("acceleration_secs", is(motion.acceleration_secs)),
+        ("jerk_secs", is(motion.jerk_secs)),
+        ("accept_no_watchdog", is(motion.accept_no_watchdog)),
+        ("odrive_endpoints", is(motion.odrive_endpoints.as_str())),
+    ])
+}
