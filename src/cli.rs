@@ -1,6 +1,6 @@
 //! The commands and what `--help` says of them; each command's flags stand at the head of its own file.
 
-use crate::commands::{bench, devices, doctor, eval, export, fk, metrics, record, render, run, sim, train};
+use crate::commands::{bench, devices, doctor, eval, export, fk, metrics, move_arm, record, render, run, sim, train};
 use clap::{ArgAction, Parser, Subcommand};
 
 /// Turns a robot's cameras and joints into a live radiance field.
@@ -50,4 +50,6 @@ pub(crate) enum Command {
     Doctor(doctor::Args),
     /// Play a rig's devices on the wire: a robot's controller, motors on CAN buses, datagrams, recordings of cameras
     Sim(sim::Args),
+    /// Move an arm to given joint positions, within its limits, while a person watches
+    Move(move_arm::Args),
 }

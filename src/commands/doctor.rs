@@ -1,10 +1,12 @@
 //! `fieldrig doctor`: what this machine lacks for a rig, each with the line that mends it.
 
 mod franka;
+mod listen;
 
 use crate::config::Rig;
 use crate::exit::Exit;
 use crate::print;
+use crate::stop::Stop;
 use drivers::v4l2;
 use serde::Serialize;
 use std::net::TcpListener;
@@ -24,9 +26,19 @@ const FINE_CLOCK: Duration = Duration::from_micros(1);
 pub(crate) struct Args {
     /// Rig file: what it names is checked against what it wants
     rig: Option<PathBuf>,
+    /// Then read the rig's devices for S seconds and tell rates, latencies and losses; nothing is moved
+    #[arg(long, value_name = "S", requires = "rig", value_parser = seconds)]
+    listen: Option<f64>,
     /// Print one JSON object a line
     #[arg(long)]
     json: bool,
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(seconds) if (1.0..=3600.0).contains(&seconds) => Ok(seconds),
+        _ => Err("allowed are 1 to 3600".to_owned()),
+    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -76,8 +88,26 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     findings.extend(can(rig.as_ref()));
     findings.extend(franka::franka(rig.as_ref()));
     findings.push(port(USUAL_ADDRESS));
-    for finding in &findings {
-        if args.json {
+    tell(&findings, args.json)?;
+    if let (Some(rig), Some(secs)) = (&rig, args.listen) {
+        let heard = listen::listen(rig, secs, &Stop::on_ctrl_c()?)?;
+        for device in &heard.devices {
+            if args.json {
+                print::json(device)?;
+            } else {
+                print::line(device)?;
+            }
+        }
+        tell(&heard.findings, args.json)?;
+        findings.extend(heard.findings);
+    }
+    let failed = findings.iter().any(|finding| finding.verdict == Verdict::Fail);
+    Ok(if failed { Exit::Failed } else { Exit::Done })
+}
+
+fn tell(findings: &[Finding], as_json: bool) -> anyhow::Result<()> {
+    for finding in findings {
+        if as_json {
             print::json(finding)?;
             continue;
         }
@@ -91,8 +121,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             print::line(format_args!("      {:12} -> {mend}", ""))?;
         }
     }
-    let failed = findings.iter().any(|finding| finding.verdict == Verdict::Fail);
-    Ok(if failed { Exit::Failed } else { Exit::Done })
+    Ok(())
 }
 
 fn gpu() -> Vec<Finding> {

@@ -7,6 +7,7 @@ pub(crate) mod eval;
 pub(crate) mod export;
 pub(crate) mod fk;
 pub(crate) mod metrics;
+pub(crate) mod move_arm;
 pub(crate) mod record;
 pub(crate) mod render;
 pub(crate) mod run;
@@ -33,6 +34,7 @@ pub(crate) fn run(command: Command) -> anyhow::Result<Exit> {
         Command::Devices(args) => devices::run(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Sim(args) => sim::run(&args),
+        Command::Move(args) => move_arm::run(&args),
     }
 }
 

@@ -9,6 +9,8 @@ mod simulated_tests;
 #[cfg(all(feature = "sim", target_os = "linux"))]
 pub(crate) use real::{franka_chain, udp_arm_address};
 
+pub(crate) use real::movable_arm;
+
 use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Override, Parent, Rig, ScannerDriver};
 use anyhow::{Context, anyhow, bail};
 use drivers::recording::{About, RIG_FILE, Recorder, Recording, URDF_FILE};

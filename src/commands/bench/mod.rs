@@ -6,6 +6,7 @@ mod curve;
 mod field;
 mod kernels;
 mod stability;
+mod stamps;
 
 use crate::exit::Exit;
 use clap::{Parser, Subcommand};
@@ -32,6 +33,8 @@ enum What {
     Ablation(ablation::Args),
     /// PSNR of held-out images over the size of a disturbance of the training images, and where it breaks
     Stability(stability::Args),
+    /// How far from the shutter the stamps of images are that come late and by another clock, as a histogram
+    Stamps(stamps::Args),
 }
 
 /// Names and milliseconds of passes, where they are asked for.
@@ -47,5 +50,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         What::Budget(args) => budget::run(args),
         What::Ablation(args) => ablation::run(args),
         What::Stability(args) => stability::run(args),
+        What::Stamps(args) => stamps::run(args),
     }
 }

@@ -1,0 +1,260 @@
+//! `fieldrig bench stamps`: how well the time of the shutter is found of images whose camera has a clock of its own and a bad cable.
+
+use crate::bench::page::{Findings, Table};
+use crate::chart::{Axis, Chart, Line, Point, Scale};
+use crate::exit::{BadArgument, Exit};
+use kinematics::{ClockMap, JointHistory, JointState, Stamp};
+use serde::Serialize;
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// Width of a bar, milliseconds.
+const BIN_MILLIS: f64 = 0.1;
+/// Bars reach so far to either side, milliseconds; what lies beyond counts in the last ones.
+const REACH_MILLIS: f64 = 8.0;
+/// Joint readings a second.
+const JOINT_RATE_HZ: u32 = 1000;
+/// The joint turns so fast, rad/s: its angle tells the time.
+const SPEED_RAD_S: f64 = 1.0;
+/// What is counted as found.
+const CLOSE_MILLIS: f64 = 1.0;
+
+/// Flags of `bench stamps`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Rates of cameras, images a second, separated by commas
+    #[arg(long, value_name = "HZ,...", value_delimiter = ',', default_value = "30,60,200")]
+    rates: Vec<f64>,
+    /// Least time from the shutter to the arrival of an image
+    #[arg(long, value_name = "MS", default_value_t = 5.0)]
+    fixed_millis: f64,
+    /// What may come on top of that, each time anew
+    #[arg(long, value_name = "MS", default_value_t = 75.0)]
+    jitter_millis: f64,
+    /// How much faster our clock runs than the camera's, parts in a million
+    #[arg(long, value_name = "PPM", default_value_t = 50.0, allow_hyphen_values = true)]
+    drift_ppm: f64,
+    /// Length of a run, and what at its beginning does not count
+    #[arg(long, value_name = "S", default_value_t = 120.0)]
+    seconds: f64,
+    #[arg(long, value_name = "S", default_value_t = 10.0)]
+    settle_seconds: f64,
+    /// Runs of each rate
+    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    seeds: u64,
+    /// Folder for charts and numbers [default: bench-stamps]
+    #[arg(long, value_name = "DIR", default_value = "bench-stamps")]
+    out: PathBuf,
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+/// How far from the shutter the pose was taken, milliseconds, for one rate.
+#[derive(Debug, Serialize)]
+struct Found {
+    rate_hz: f64,
+    /// Whether the fixed part of the latency is in the rig file.
+    is_calibrated: bool,
+    images: usize,
+    within_1_ms_frac: f64,
+    median_millis: f64,
+    p99_abs_millis: f64,
+    worst_abs_millis: f64,
+    /// Share of the images in each bar, from -8 ms on in steps of 0.1 ms.
+    bars: Vec<f64>,
+}
+
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    check(args)?;
+    let mut found = Vec::new();
+    for rate_hz in &args.rates {
+        let errors: Vec<f64> = (1..=args.seeds).flat_map(|seed| errors_millis(args, *rate_hz, seed)).collect();
+        for is_calibrated in [true, false] {
+            // What the rig file says is taken off every stamp alike.
+            let known = if is_calibrated { args.fixed_millis } else { 0.0 };
+            found.push(Found::of(*rate_hz, is_calibrated, errors.iter().map(|error| error - known).collect()));
+        }
+    }
+    std::fs::create_dir_all(&args.out)
+        .map_err(|error| anyhow::Error::new(error).context(format!("cannot make {}", args.out.display())))?;
+    let findings = findings(args, &found)?;
+    findings.tell(&findings.write(&args.out)?, args.json)?;
+    Ok(Exit::Done)
+}
+
+fn check(args: &Args) -> Result<(), BadArgument> {
+    let numbers = [
+        ("--rates", args.rates.iter().copied().fold(f64::INFINITY, f64::min), 1.0..=10_000.0),
+        ("--rates", args.rates.iter().copied().fold(0.0, f64::max), 1.0..=10_000.0),
+        ("--fixed-millis", args.fixed_millis, 0.0..=1000.0),
+        ("--jitter-millis", args.jitter_millis, 0.0..=1000.0),
+        ("--drift-ppm", args.drift_ppm, -200.0..=200.0),
+        ("--seconds", args.seconds, 1.0..=3600.0),
+        ("--settle-seconds", args.settle_seconds, 0.0..=args.seconds - 0.5),
+    ];
+    match numbers.into_iter().find(|(_, number, allowed)| !allowed.contains(number)) {
+        Some((flag, number, allowed)) => {
+            Err(BadArgument(format!("{flag}: {number} is not from {} to {}", allowed.start(), allowed.end())))
+        }
+        None => Ok(()),
+    }
+}
+
+/// For each image after the beginning, how much later than its shutter the pose is that the join would take for it; the fixed part of
+/// the latency is in it.
+#[expect(clippy::cast_possible_truncation, reason = "times of an hour at most, in nanoseconds")]
+fn errors_millis(args: &Args, rate_hz: f64, seed: u64) -> Vec<f64> {
+    let mut random = seed;
+    let mut clock = ClockMap::new();
+    let n_readings = (args.seconds + args.fixed_millis * 1e-3 + args.jitter_millis * 1e-3 + 1.0) * f64::from(JOINT_RATE_HZ);
+    let mut joints = JointHistory::new(Duration::from_millis(100), n_readings.ceil() as usize + 1);
+    for ix in 0..n_readings.ceil() as i64 {
+        let stamp = Stamp(ix * 1_000_000_000 / i64::from(JOINT_RATE_HZ));
+        let position = vec![SPEED_RAD_S * stamp.secs_since(Stamp(0))];
+        let state = JointState { stamp, position, velocity: vec![SPEED_RAD_S], effort: Vec::new() };
+        joints.push(state).expect("in order, and numbers");
+    }
+    let mut errors = Vec::new();
+    for ix in 0..(args.seconds * rate_hz) as i64 {
+        let shutter_secs = ix as f64 / rate_hz;
+        let device_nanos = (shutter_secs / (1.0 + args.drift_ppm * 1e-6) * 1e9) as i64;
+        let late_millis = args.fixed_millis + args.jitter_millis * uniform(&mut random);
+        let arrival = Stamp(((shutter_secs + late_millis * 1e-3) * 1e9) as i64);
+        let stamp = clock.stamp(device_nanos, arrival);
+        if shutter_secs < args.settle_seconds {
+            continue;
+        }
+        if let Ok(state) = joints.at(stamp) {
+            errors.push((state.position[0] / SPEED_RAD_S - shutter_secs) * 1e3);
+        }
+    }
+    errors
+}
+
+/// The next of a series of numbers from 0 to 1. Source: Steele, Lea and Flood 2014, `SplitMix64`.
+fn uniform(state: &mut u64) -> f64 {
+    *state = state.wrapping_add(0x9E37_79B9_7F4A_7C15);
+    let mut mixed = *state;
+    mixed = (mixed ^ (mixed >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+    ((mixed ^ (mixed >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
+}
+
+impl Found {
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped into the bars")]
+    fn of(rate_hz: f64, is_calibrated: bool, mut errors: Vec<f64>) -> Self {
+        let n_bars = (2.0 * REACH_MILLIS / BIN_MILLIS).round() as usize;
+        let mut bars = vec![0.0; n_bars];
+        let n = errors.len();
+        for error in &errors {
+            let bar = ((error + REACH_MILLIS) / BIN_MILLIS).floor().max(0.0) as usize;
+            bars[bar.min(n_bars - 1)] += 1.0 / n as f64;
+        }
+        errors.sort_by(f64::total_cmp);
+        let median_millis = errors.get(n / 2).copied().unwrap_or(f64::NAN);
+        let mut sizes: Vec<f64> = errors.iter().map(|error| error.abs()).collect();
+        sizes.sort_by(f64::total_cmp);
+        Self {
+            rate_hz,
+            is_calibrated,
+            images: n,
+            within_1_ms_frac: sizes.partition_point(|size| *size <= CLOSE_MILLIS) as f64 / n as f64,
+            median_millis,
+            p99_abs_millis: sizes.get(n * 99 / 100).copied().unwrap_or(f64::NAN),
+            worst_abs_millis: sizes.last().copied().unwrap_or(f64::NAN),
+            bars,
+        }
+    }
+
+    fn label(&self) -> String {
+        let told = if self.is_calibrated { "" } else { ", fixed part unknown" };
+        format!("{} Hz{told}", self.rate_hz)
+    }
+}
+
+fn findings(args: &Args, found: &[Found]) -> anyhow::Result<Findings> {
+    let point = |(ix, share): (usize, &f64)| {
+        let y = 100.0 * share;
+        Point { x: (ix as f64 + 0.5) * BIN_MILLIS - REACH_MILLIS, y, low: y, high: y }
+    };
+    let line = |found: &Found| Line {
+        label: found.label(),
+        points: found.bars.iter().enumerate().map(point).collect(),
+        is_foreign: !found.is_calibrated,
+    };
+    let conditions = format!(
+        "{} ms fixed latency, 0 to {} ms of jitter, {} ppm of drift; {} runs of {} s, the first {} s left out",
+        args.fixed_millis, args.jitter_millis, args.drift_ppm, args.seeds, args.seconds, args.settle_seconds
+    );
+    let row = |found: &Found| {
+        vec![
+            found.label(),
+            format!("{}", found.images),
+            format!("{:.2}", 100.0 * found.within_1_ms_frac),
+            format!("{:+.3}", found.median_millis),
+            format!("{:.3}", found.p99_abs_millis),
+            format!("{:.3}", found.worst_abs_millis),
+        ]
+    };
+    let head = ["camera", "images", "within 1 ms, %", "median, ms", "99 % within, ms", "worst, ms"];
+    Ok(Findings {
+        name: "stamps",
+        title: "When the shutter was open".to_owned(),
+        sentences: vec![
+            format!("{conditions}."),
+            "A joint turns at 1 rad/s and is read a thousand times a second; the angle at the stamp of an image tells how far that stamp is from its shutter. \
+             The fixed part of a latency cannot be seen in stamps: it stands in the rig file (stamp_to_mid_exposure_millis), or is warned of and stays."
+                .to_owned(),
+        ],
+        charts: vec![(
+            "",
+            Chart {
+                title: "From the shutter to the stamp that the pose is taken at".to_owned(),
+                subtitle: conditions,
+                x: Axis { label: "ms".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
+                y: Axis { label: "share of images, % in 0.1 ms".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
+                lines: found.iter().map(line).collect(),
+                floors: Vec::new(),
+                rules: Vec::new(),
+            },
+        )],
+        tables: vec![Table {
+            title: "Stamps".to_owned(),
+            head: head.map(str::to_owned).to_vec(),
+            rows: found.iter().map(row).collect(),
+        }],
+        numbers: serde_json::to_value(found)?,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Flags {
+        #[command(flatten)]
+        args: Args,
+    }
+
+    #[test]
+    fn shutters_are_found_to_a_millisecond_once_the_fixed_part_is_known() {
+        let args = Flags::parse_from(["stamps", "--rates", "30", "--seeds", "3"]).args;
+        let errors: Vec<f64> = (1..=3).flat_map(|seed| errors_millis(&args, 30.0, seed)).collect();
+        let known = Found::of(30.0, true, errors.iter().map(|error| error - 5.0).collect());
+        assert_eq!(known.within_1_ms_frac, 1.0, "{known:?}");
+        assert!((known.bars.iter().sum::<f64>() - 1.0).abs() < 1e-9);
+        let unknown = Found::of(30.0, false, errors);
+        assert!((unknown.median_millis - 5.0).abs() < 0.5 && unknown.within_1_ms_frac == 0.0, "{unknown:?}");
+    }
+
+    #[test]
+    fn numbers_that_make_no_sense_are_refused() {
+        for flags in [["--seconds", "0"], ["--rates", "0,30"], ["--drift-ppm", "-900"], ["--settle-seconds", "500"]] {
+            let args = Flags::parse_from(["stamps"].into_iter().chain(flags)).args;
+            assert!(check(&args).is_err_and(|error| error.to_string().contains(flags[0])), "{flags:?}");
+        }
+    }
+}

@@ -1,0 +1,237 @@
+//! What a rig's devices truly deliver: each is read for a while with the drivers of `run`, nothing is moved.
+
+use super::Finding;
+use crate::config::{BaseDriver, Rig};
+use crate::join::{Join, JoinEvent};
+use crate::open::{self, Devices, Opened};
+use crate::stop::Stop;
+use drivers::{Sample, clock};
+use kinematics::Stamp;
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+/// A device that comes this much more slowly than the rig file says is told.
+const MIN_RATE_FRAC: f64 = 0.95;
+
+/// Of a device, or of what the join makes of it.
+#[derive(Debug, PartialEq, Serialize)]
+pub(super) struct Delivered {
+    device: String,
+    samples: u64,
+    rate_hz: f64,
+    /// What the rig file says; `None` where it does not.
+    wanted_hz: Option<f64>,
+    /// Images that the device or the driver lost.
+    lost: u64,
+    /// From mid-exposure, or from the stamp of a state, to when it can be used here; half of all, 99 of 100, and all take no longer.
+    latency_p50_millis: f64,
+    latency_p99_millis: f64,
+    latency_max_millis: f64,
+    /// 99 of 100 follow within this on the one before.
+    gap_p99_millis: f64,
+}
+
+/// The whole of what was heard.
+#[derive(Debug)]
+pub(super) struct Heard {
+    pub(super) devices: Vec<Delivered>,
+    pub(super) findings: Vec<Finding>,
+}
+
+/// What is noted of each sample.
+#[derive(Debug, Default)]
+struct Track {
+    stamps: Vec<Stamp>,
+    latency_millis: Vec<f64>,
+    lost: u64,
+}
+
+impl Track {
+    fn note(&mut self, stamp: Stamp, now: Stamp) {
+        self.stamps.push(stamp);
+        self.latency_millis.push(now.secs_since(stamp) * 1e3);
+    }
+
+    fn told(mut self, device: String, wanted_hz: Option<f64>) -> Delivered {
+        let mut gaps: Vec<f64> = self.stamps.windows(2).map(|pair| pair[1].secs_since(pair[0]) * 1e3).collect();
+        gaps.sort_by(f64::total_cmp);
+        self.latency_millis.sort_by(f64::total_cmp);
+        let spanned = match (self.stamps.first(), self.stamps.last()) {
+            (Some(first), Some(last)) => last.secs_since(*first),
+            _ => 0.0,
+        };
+        let n_gaps = self.stamps.len().saturating_sub(1);
+        Delivered {
+            device,
+            samples: self.stamps.len() as u64,
+            rate_hz: if spanned > 0.0 { n_gaps as f64 / spanned } else { 0.0 },
+            wanted_hz,
+            lost: self.lost,
+            latency_p50_millis: share(&self.latency_millis, 0.5),
+            latency_p99_millis: share(&self.latency_millis, 0.99),
+            latency_max_millis: share(&self.latency_millis, 1.0),
+            gap_p99_millis: share(&gaps, 0.99),
+        }
+    }
+}
+
+/// The number that so large a share of sorted ones do not exceed; 0 of none.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "an index below the length")]
+fn share(sorted: &[f64], frac: f64) -> f64 {
+    let ix = (frac * sorted.len() as f64).ceil() as usize;
+    sorted.get(ix.saturating_sub(1)).copied().unwrap_or(0.0)
+}
+
+/// Reads the rig's devices for so many seconds, or until Ctrl-C.
+pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Heard> {
+    let Opened { rig, mut source, .. } = open::rig(rig.clone(), Devices::Real)?;
+    let mut join = Join::new(&rig)?;
+    let mut tracks: BTreeMap<String, Track> = BTreeMap::new();
+    let mut findings = Vec::new();
+    let (began, cpu_began) = (Instant::now(), cpu_secs());
+    while !stop.asked() && began.elapsed().as_secs_f64() < secs {
+        let sample = match source.next_sample() {
+            Ok(Some(sample)) => sample,
+            Ok(None) => break,
+            Err(error) => {
+                findings.push(Finding::fail("devices", format!("{error}"), "look at the device and its cable"));
+                break;
+            }
+        };
+        let now = clock::now();
+        let (device, lost) = match &sample {
+            Sample::Image(image) if image.is_depth() => (format!("camera {:?} depth", image.camera), image.n_skipped),
+            Sample::Image(image) => (format!("camera {:?}", image.camera), image.n_skipped),
+            Sample::Joints(_) => ("arm".to_owned(), 0),
+            Sample::Base(_) => ("base".to_owned(), 0),
+            Sample::Range(scan) => (format!("range scanner {:?}", scan.scanner), 0),
+            Sample::Truth(_) | Sample::BaseTruth(_) => continue,
+        };
+        let track = tracks.entry(device).or_default();
+        track.note(sample.stamp(), now);
+        track.lost += lost;
+        for event in join.push(sample) {
+            if let JoinEvent::Accepted(keyframe) = event {
+                let track = tracks.entry(format!("keyframes of {:?}", keyframe.camera)).or_default();
+                track.note(keyframe.stamp, clock::now());
+            }
+        }
+    }
+    let (spent, cpu) = (began.elapsed(), cpu_secs() - cpu_began);
+    findings.push(Finding::ok("processor", cpu_told(cpu, spent)));
+    let wanted = wanted(&rig);
+    findings.extend(missing(&wanted, &tracks));
+    let devices: Vec<_> = tracks
+        .into_iter()
+        .map(|(device, track)| {
+            let wanted_hz = wanted.get(&device).copied().flatten();
+            track.told(device, wanted_hz)
+        })
+        .collect();
+    findings.extend(devices.iter().filter_map(complaint));
+    let refused: Vec<_> =
+        join.counts().refused.iter().map(|(why, n)| format!("{n} {}", why.name())).collect();
+    if !refused.is_empty() {
+        findings.push(Finding::ok("join", format!("images that became no keyframe: {}", refused.join(", "))));
+    }
+    Ok(Heard { devices, findings })
+}
+
+/// The devices of a rig, and how often each is to say something where the rig file tells that.
+fn wanted(rig: &Rig) -> BTreeMap<String, Option<f64>> {
+    use crate::config::ArmDriver;
+    let mut wanted = BTreeMap::new();
+    for camera in &rig.cameras {
+        wanted.insert(format!("camera {:?}", camera.name), Some(camera.rate_hz));
+        if camera.depth.is_some() {
+            wanted.insert(format!("camera {:?} depth", camera.name), Some(camera.rate_hz));
+        }
+    }
+    match rig.arm.driver {
+        ArmDriver::None => {}
+        ArmDriver::Franka => drop(wanted.insert("arm".to_owned(), Some(1000.0))),
+        // Motors that report by themselves have rates of their own.
+        _ => drop(wanted.insert("arm".to_owned(), None)),
+    }
+    if rig.base.driver != BaseDriver::Fixed {
+        wanted.insert("base".to_owned(), None);
+    }
+    for scanner in &rig.scanners {
+        wanted.insert(format!("range scanner {:?}", scanner.name), Some(scanner.rate_hz));
+    }
+    wanted
+}
+
+fn missing(wanted: &BTreeMap<String, Option<f64>>, tracks: &BTreeMap<String, Track>) -> Vec<Finding> {
+    let silent = wanted.keys().filter(|device| !tracks.contains_key(*device));
+    silent.map(|device| Finding::fail("silent", format!("{device} said nothing"), "look at it and its cable")).collect()
+}
+
+/// What is wrong with how a device delivers.
+fn complaint(delivered: &Delivered) -> Option<Finding> {
+    let Delivered { device, rate_hz, wanted_hz, lost, .. } = delivered;
+    let slow = wanted_hz.filter(|wanted| *rate_hz < MIN_RATE_FRAC * wanted);
+    let says = match (slow, lost) {
+        (None, 0) => return None,
+        (Some(wanted), 0) => format!("{device} comes {rate_hz:.1} times a second, the rig file says {wanted:.1}"),
+        (None, lost) => format!("{device} lost {lost} images"),
+        (Some(wanted), lost) => {
+            format!("{device} comes {rate_hz:.1} times a second, the rig file says {wanted:.1}; {lost} images were lost")
+        }
+    };
+    Some(Finding::warn("rate", says, "usual causes: bad light with automatic exposure, a slow bus, a busy processor"))
+}
+
+impl std::fmt::Display for Delivered {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { device, samples, rate_hz, latency_p50_millis: half, latency_p99_millis: most, gap_p99_millis, .. } = self;
+        write!(
+            f,
+            "{device}: {samples}, {rate_hz:.1} a second, {half:.1} ms old (99 %: {most:.1}) when they are here, \
+             at most {gap_p99_millis:.1} ms apart (99 %), {} lost",
+            self.lost
+        )
+    }
+}
+
+/// Time that this process has kept processors busy, seconds.
+fn cpu_secs() -> f64 {
+    let spent = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
+    spent.tv_sec as f64 + spent.tv_nsec as f64 * 1e-9
+}
+
+fn cpu_told(cpu_secs: f64, spent: Duration) -> String {
+    format!("{:.1} % of one core was busy with reading and joining", 100.0 * cpu_secs / spent.as_secs_f64().max(1e-9))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn track(n: i64, period_millis: i64, lost: u64) -> Track {
+        let mut track = Track { lost, ..Track::default() };
+        for ix in 0..n {
+            let stamp = Stamp(ix * period_millis * 1_000_000);
+            // One in a hundred comes late.
+            track.note(stamp, stamp.plus_secs(if ix % 100 == 50 { 0.5 } else { 0.01 }));
+        }
+        track
+    }
+
+    #[test]
+    fn rates_latencies_and_losses_are_told_and_complained_of() {
+        let told = track(301, 100, 0).told("camera \"wrist\"".into(), Some(10.0));
+        assert!((told.rate_hz - 10.0).abs() < 1e-9);
+        assert!((told.latency_p50_millis - 10.0).abs() < 1e-6 && (told.latency_p99_millis - 10.0).abs() < 1e-6);
+        assert!((told.latency_max_millis - 500.0).abs() < 1e-6);
+        assert_eq!(complaint(&told), None);
+        assert!(told.to_string().contains("301, 10.0 a second, 10.0 ms old"), "{told}");
+        let slow = track(301, 100, 0).told("camera \"wrist\"".into(), Some(15.0));
+        assert!(complaint(&slow).is_some_and(|finding| finding.says.contains("the rig file says 15.0")));
+        let lossy = track(301, 100, 4).told("camera \"wrist\"".into(), Some(10.0));
+        assert!(complaint(&lossy).is_some_and(|finding| finding.says.contains("lost 4 images")));
+        let nothing = Track::default().told("arm".into(), None);
+        assert_eq!((nothing.rate_hz, nothing.latency_p99_millis), (0.0, 0.0));
+    }
+}

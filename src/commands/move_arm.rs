@@ -1,0 +1,208 @@
+//! `fieldrig move`: takes an arm to given joint positions, within its limits, with a person watching.
+
+use crate::config::Rig;
+use crate::exit::{BadArgument, Exit};
+use crate::open;
+use crate::print;
+use crate::stop::Stop;
+use anyhow::{Context, bail};
+use drivers::motion::{JointTarget, Motion, OnLoss};
+use drivers::{Error, MovableArm, clock};
+use indicatif::ProgressBar;
+use kinematics::{JointState, Stamp};
+use serde::Serialize;
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// How soon Ctrl-C is noticed.
+const POLL: Duration = Duration::from_millis(50);
+/// A movable arm that says nothing for so long is lost, whatever it was asked for.
+const MAX_SILENCE: Duration = Duration::from_secs(2);
+
+/// Flags of `move`.
+#[derive(Debug, clap::Args)]
+#[command(group = clap::ArgGroup::new("what").required(true).multiple(true).args(["to", "by", "recover"]))]
+pub(crate) struct Args {
+    /// The arm (TOML); its table [arm.motion] says how it may be moved
+    rig_file: PathBuf,
+    /// Positions of all joints in the order of arm.joints, rad or m: 0,-0.5,0,-2.0,0,1.8,0.7
+    #[arg(long, value_name = "Q,Q,...", value_delimiter = ',', allow_hyphen_values = true, conflicts_with = "by")]
+    to: Option<Vec<f64>>,
+    /// Move this joint by so much from where it is, rad or m; may be given for several joints
+    #[arg(long, value_name = "JOINT=DELTA", value_parser = delta)]
+    by: Vec<(String, f64)>,
+    /// First switch an arm that stopped on again; look at it before
+    #[arg(long)]
+    recover: bool,
+    /// Yes, move it: nobody is in its reach, and a hand is on the emergency stop
+    #[arg(long, required = true)]
+    enable_motion: bool,
+    /// End as soon as it has arrived, also where its motors let go of it then
+    #[arg(long)]
+    leave: bool,
+    /// Print one JSON object a line
+    #[arg(long)]
+    json: bool,
+}
+
+fn delta(text: &str) -> Result<(String, f64), String> {
+    let parsed = text.split_once('=').and_then(|(joint, delta)| Some((joint.to_owned(), delta.parse().ok()?)));
+    parsed.filter(|(_, delta): &(String, f64)| delta.is_finite()).ok_or_else(|| "write it as JOINT=0.1".to_owned())
+}
+
+/// What is told at the end of a way.
+#[derive(Debug, Serialize)]
+struct Arrived<'a> {
+    event: &'static str,
+    joints: &'a [String],
+    /// Where it was headed for, and where the joints say they are, rad or m.
+    target: &'a [f64],
+    position: &'a [f64],
+    /// The largest difference of these.
+    error: f64,
+    seconds: f64,
+}
+
+/// Moves the arm, and holds it where it would let go.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let stop = Stop::on_ctrl_c()?;
+    let rig = Rig::load(&args.rig_file, &[])?;
+    let Some(motion) = rig.arm.motion.as_ref() else {
+        return Err(BadArgument(
+            "the rig file has no table [arm.motion], so its arm is only read; docs/rig.md tells its keys".to_owned(),
+        )
+        .into());
+    };
+    check(args, &rig)?;
+    let arm = open::movable_arm(&rig)?;
+    let mut offsets = rig.arm.joint_offsets.clone();
+    offsets.resize(rig.arm.joints.len(), 0.0);
+    let mut mover = Mover { arm, offsets, stop, bar: print::bar(None, "{spinner} {elapsed} {msg}", args.json) };
+    if args.recover {
+        mover.arm.recover()?;
+        log::info!("the arm is switched on again");
+    }
+    let at_first = mover.read()?;
+    if args.to.is_some() || !args.by.is_empty() {
+        let wanted = target(args, &rig.arm.joints, &at_first);
+        let target = mover.command(&wanted)?;
+        for (joint, (wanted, taken)) in rig.arm.joints.iter().zip(wanted.position.iter().zip(&target.position)) {
+            if (wanted - taken).abs() > 1e-9 {
+                log::warn!("joint {joint:?} is sent to {taken:.4}, the end of its range, rather than {wanted:.4}");
+            }
+        }
+        let began = clock::now();
+        let last = mover.follow(&target)?;
+        tell(args, &rig.arm.joints, &target, &last, began)?;
+    }
+    if motion.on_loss != OnLoss::Hold && !args.leave {
+        log::info!("the arm is held until Ctrl-C; its motors let go of it then: support it first");
+        mover.hold()?;
+    }
+    mover.bar.finish_and_clear();
+    Ok(Exit::Done)
+}
+
+/// What can be seen to be wrong before anything is opened.
+fn check(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
+    let joints = &rig.arm.joints;
+    if let Some(to) = args.to.as_ref().filter(|to| to.len() != joints.len()) {
+        let (n, names) = (to.len(), joints.join(", "));
+        return Err(BadArgument(format!("--to has {n} positions, the arm has {} joints: {names}", joints.len())));
+    }
+    if let Some((joint, _)) = args.by.iter().find(|(joint, _)| !joints.contains(joint)) {
+        return Err(BadArgument(format!("--by: there is no joint {joint:?}, but {}", joints.join(", "))));
+    }
+    Ok(())
+}
+
+fn target(args: &Args, joints: &[String], now: &JointState) -> JointTarget {
+    let mut position = args.to.clone().unwrap_or_else(|| now.position.clone());
+    for (joint, delta) in &args.by {
+        let moved = joints.iter().zip(&mut position).find(|(name, _)| *name == joint);
+        if let Some((_, position)) = moved {
+            *position += delta;
+        }
+    }
+    JointTarget { position }
+}
+
+fn tell(args: &Args, joints: &[String], target: &JointTarget, last: &JointState, began: Stamp) -> anyhow::Result<()> {
+    let apart = target.position.iter().zip(&last.position).map(|(target, is)| (target - is).abs());
+    let (error, seconds) = (apart.fold(0.0, f64::max), clock::now().secs_since(began));
+    if args.json {
+        let (target, position) = (&target.position[..], &last.position[..]);
+        return print::json(&Arrived { event: "done", joints, target, position, error, seconds });
+    }
+    Ok(print::line(format_args!("arrived after {seconds:.1} s at {}, {error:.5} off at most", told(&last.position)))?)
+}
+
+fn told(position: &[f64]) -> String {
+    position.iter().map(|position| format!("{position:.4}")).collect::<Vec<_>>().join(", ")
+}
+
+/// The arm and who watches it.
+struct Mover {
+    arm: Box<dyn MovableArm>,
+    /// What is added to what the joints tell, as wherever else they are read.
+    offsets: Vec<f64>,
+    stop: Stop,
+    bar: ProgressBar,
+}
+
+impl Mover {
+    /// The next joint state; an arm that stopped by itself, or says nothing, is an error.
+    fn read(&mut self) -> anyhow::Result<JointState> {
+        let until = clock::now().plus_secs(MAX_SILENCE.as_secs_f64());
+        loop {
+            let state = self.arm.read(POLL);
+            if let Motion::Stopped { reason } = self.arm.motion() {
+                bail!("the arm stopped: {reason}. Look at it, then switch it on again with --recover");
+            }
+            match state {
+                Err(Error::NoJoints { .. }) if clock::now() < until => {}
+                state => {
+                    let mut state = state?;
+                    state.position.iter_mut().zip(&self.offsets).for_each(|(position, offset)| *position += offset);
+                    return Ok(state);
+                }
+            }
+        }
+    }
+
+    /// Heads for a target; what is truly headed for comes back.
+    fn command(&mut self, wanted: &JointTarget) -> Result<JointTarget, Error> {
+        let shifted = |target: &JointTarget, sign: f64| JointTarget {
+            position: target.position.iter().zip(&self.offsets).map(|(position, offset)| position + sign * offset).collect(),
+        };
+        let taken = self.arm.command(&shifted(wanted, -1.0))?;
+        Ok(shifted(&taken, 1.0))
+    }
+
+    /// Waits until it has arrived; Ctrl-C brings it to rest on the way, which is an error.
+    fn follow(&mut self, target: &JointTarget) -> anyhow::Result<JointState> {
+        loop {
+            let state = self.read()?;
+            if self.arm.motion() == Motion::Held {
+                return Ok(state);
+            }
+            self.bar.set_message(format!("at {} of {}", told(&state.position), told(&target.position)));
+            if self.stop.asked() {
+                self.arm.stop().context("the arm could not be stopped")?;
+                while self.arm.motion() == Motion::Moving {
+                    self.read()?;
+                }
+                bail!("stopped on the way, at {}", told(&self.read()?.position));
+            }
+        }
+    }
+
+    /// Keeps it where it is until Ctrl-C.
+    fn hold(&mut self) -> anyhow::Result<()> {
+        while !self.stop.asked() {
+            let state = self.read()?;
+            self.bar.set_message(format!("held at {}", told(&state.position)));
+        }
+        Ok(())
+    }
+}
