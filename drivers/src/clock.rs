@@ -5,7 +5,17 @@ use rustix::time::{ClockId, clock_gettime};
 
 /// Now, on the kernel's `CLOCK_MONOTONIC`: the clock of every program on this computer, and of V4L2's images.
 pub fn now() -> Stamp {
+    read(ClockId::Monotonic)
+}
+
+/// Now, on a clock that also counts while the computer sleeps: for what must be noticed after that, and nothing else.
+#[cfg(target_os = "linux")]
+pub(crate) fn now_with_sleep() -> Stamp {
+    read(ClockId::Boottime)
+}
+
+fn read(clock: ClockId) -> Stamp {
     const NANOS_PER_SEC: i64 = 1_000_000_000;
-    let now = clock_gettime(ClockId::Monotonic);
+    let now = clock_gettime(clock);
     Stamp(now.tv_sec.saturating_mul(NANOS_PER_SEC).saturating_add(now.tv_nsec))
 }

@@ -99,6 +99,12 @@ pub enum Error {
         /// What is wrong, and what mends it.
         reason: String,
     },
+    /// An arm cannot be moved, or not so.
+    #[error("the arm is not moved: {reason}")]
+    Motion {
+        /// Why.
+        reason: String,
+    },
     /// A Franka arm does not let us in, is another than the rig file says, or was lost.
     #[error("arm at {address}: {reason}")]
     Fci {

@@ -1,13 +1,15 @@
 //! The devices of a rig that are not simulated.
 
-use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Depth, Rig, ScannerDriver};
+use crate::config::{ArmDriver, ArmMotion, BaseDriver, Camera, CameraDriver, Depth, Rig, ScannerDriver};
 use anyhow::{Context, bail};
 #[cfg(target_os = "linux")]
-use drivers::can::{self, CanArm};
+use drivers::can::{self, CanArm, MovableArmConfig, MovableCanArm};
 #[cfg(target_os = "linux")]
 use drivers::franka::{self, FrankaArm};
+use drivers::motion::{MotionConfig, MotionLimits, MovableArm};
 use drivers::udp::{UdpArm, UdpBase, UdpScanner};
 use drivers::v4l2::{Config, Settings, V4l2Camera, V4l2Format};
+use drivers::wire::can::odrive::Endpoints;
 use drivers::{Arm, Base, Devices, RangeScanner};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
@@ -43,12 +45,68 @@ pub(super) fn open(rig: &Rig) -> anyhow::Result<Devices> {
     Ok(devices)
 }
 
+/// Opens the arm to be moved: it is switched on and held where it is. Its joints are as the device tells them, without
+/// `arm.joint_offsets`.
+#[expect(dead_code, reason = "the command that moves an arm is the one that opens it so")]
+pub(crate) fn movable_arm(rig: &Rig) -> anyhow::Result<Box<dyn MovableArm>> {
+    let Some(motion) = &rig.arm.motion else {
+        bail!(
+            "the rig file has no table [arm.motion], so its arm is only read: docs/hardware.md says what belongs into it"
+        );
+    };
+    match rig.arm.driver {
+        ArmDriver::Can => movable_can_arm(rig, motion),
+        _ => bail!("arms of this driver are only read"),
+    }
+}
+
+/// How each joint may be moved: the description's limits, the rig's speed.
+fn motion_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MotionConfig> {
+    let Rig { arm, .. } = rig;
+    let chain =
+        kinematics::Chain::from_urdf(&arm.urdf_text, &arm.base_link, &arm.flange_link).context("the arm's URDF")?;
+    let mut limits = Vec::new();
+    for (ix, name) in arm.joints.iter().enumerate() {
+        let place = chain.joint_names().iter().position(|known| known == name);
+        let joint = place.map(|place| chain.limits()[place]).context("a joint of the rig is not in its URDF")?;
+        let mut joint = MotionLimits::new(&joint, arm.max_speed_rad_s, motion.acceleration_secs, motion.jerk_secs);
+        // The description's angles are those told plus the offset.
+        let offset = arm.joint_offsets.get(ix).copied().unwrap_or(0.0);
+        joint.position = joint.position.map(|bound| bound - offset);
+        limits.push(joint);
+    }
+    let timeout = Duration::from_secs_f64(motion.timeout_millis / 1000.0);
+    let ArmMotion { on_loss, accept_no_watchdog, .. } = *motion;
+    Ok(MotionConfig { limits, on_loss, timeout, accept_no_watchdog })
+}
+
+#[cfg(target_os = "linux")]
+fn movable_can_arm(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<Box<dyn MovableArm>> {
+    let path = &motion.odrive_endpoints;
+    let endpoints = || -> anyhow::Result<Endpoints> { Ok(Endpoints::parse(&std::fs::read_to_string(path)?)?) };
+    let odrive_endpoints = match path.as_str() {
+        "" => None,
+        _ => Some(endpoints().with_context(|| format!("arm.motion.odrive_endpoints {path:?}"))?),
+    };
+    let config = MovableArmConfig { arm: can_config(rig), motion: motion_config(rig, motion)?, odrive_endpoints };
+    Ok(Box::new(MovableCanArm::open(&config)?))
+}
+
+#[cfg(not(target_os = "linux"))]
+fn movable_can_arm(_rig: &Rig, _motion: &ArmMotion) -> anyhow::Result<Box<dyn MovableArm>> {
+    bail!("arms on CAN buses are moved on Linux only")
+}
+
+#[cfg(target_os = "linux")]
+fn can_config(rig: &Rig) -> can::ArmConfig {
+    let Rig { arm, .. } = rig;
+    can::ArmConfig { buses: arm.buses.clone(), motors: arm.motors.clone(), rate_hz: arm.rate_hz }
+}
+
 /// An arm whose joints are motors on CAN buses.
 #[cfg(target_os = "linux")]
 fn can_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
-    let Rig { arm, .. } = rig;
-    let config = can::ArmConfig { buses: arm.buses.clone(), motors: arm.motors.clone(), rate_hz: arm.rate_hz };
-    Ok(Box::new(CanArm::open(&config)?))
+    Ok(Box::new(CanArm::open(&can_config(rig))?))
 }
 
 #[cfg(not(target_os = "linux"))]

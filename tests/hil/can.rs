@@ -14,22 +14,22 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-const DAMIAO_LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
+pub(crate) const DAMIAO_LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
 const UNITS: Units = Units { counts_per_turn: 65_536.0, rated_torque_nm: 10.0 };
 /// The joints swing so far, rad, and so fast, rad/s.
 const SWING_RAD: f64 = 0.5;
 const SWING_RAD_S: f64 = 2.0;
 
-fn ip(words: &str) {
+pub(crate) fn ip(words: &str) {
     let output = Command::new("/bin/busybox").arg("ip").args(words.split(' ')).output().expect("busybox has ip");
     assert!(output.status.success(), "ip {words}: {}", String::from_utf8_lossy(&output.stderr));
 }
 
 /// A virtual bus that is up; removed again when dropped.
-struct Wire(&'static str);
+pub(crate) struct Wire(&'static str);
 
 impl Wire {
-    fn new(name: &'static str, is_fd: bool) -> Self {
+    pub(crate) fn new(name: &'static str, is_fd: bool) -> Self {
         ip(&format!("link add dev {name} type vcan"));
         if is_fd {
             ip(&format!("link set {name} mtu 72"));
@@ -38,7 +38,7 @@ impl Wire {
         Self(name)
     }
 
-    fn config(&self, is_fd: bool) -> BusConfig {
+    pub(crate) fn config(&self, is_fd: bool) -> BusConfig {
         BusConfig { interface: self.0.to_owned(), bitrate_hz: 1_000_000, data_bitrate_hz: is_fd.then_some(5_000_000) }
     }
 }
@@ -120,7 +120,7 @@ impl Drop for Bench {
     }
 }
 
-fn motor(joint: &str, family: Family) -> MotorConfig {
+pub(crate) fn motor(joint: &str, family: Family) -> MotorConfig {
     MotorConfig {
         joint: joint.to_owned(),
         bus_ix: 0,
@@ -132,12 +132,12 @@ fn motor(joint: &str, family: Family) -> MotorConfig {
     }
 }
 
-fn damiao(ix: u16) -> MotorConfig {
+pub(crate) fn damiao(ix: u16) -> MotorConfig {
     motor(&format!("damiao{ix}"), Family::Damiao { motor: ix, feedback: 0x10 + ix })
 }
 
 /// One motor of each family, two of them behind gears or reversed.
-fn all_families() -> Vec<MotorConfig> {
+pub(crate) fn all_families() -> Vec<MotorConfig> {
     let node = |number| canopen::Node::new(number).expect("a node");
     vec![
         damiao(1),

@@ -2,12 +2,13 @@
 //! User-Mode Linux kernel that is built once.
 //!
 //! The test below runs on the host: it lays out a root folder with this very program in it, boots the kernel on it and reads its
-//! console. Inside, the same program runs the tests of `cameras.rs` and `can.rs`, which are ignored outside.
+//! console. Inside, the same program runs the tests of `cameras.rs`, `can.rs` and `can_motion.rs`, which are ignored outside.
 
 #![expect(clippy::print_stdout, reason = "the report of what was seen in the virtual kernel")]
 
 mod cameras;
 mod can;
+mod can_motion;
 
 use std::collections::BTreeSet;
 use std::fs;

@@ -2,8 +2,9 @@
 
 use super::bus::{Arrived, Bus, WireErrors};
 use super::config::{ArmConfig, BusConfig};
-use super::motor::{Motor, Reading};
-use crate::wire::can::frame::{Bits, Stuffing, load_frac};
+use super::joints::{Joints, Told};
+use super::motor::Motor;
+use super::pace::affordable_hz;
 use crate::wire::can::{Frame, canopen};
 use crate::{Arm, Error, clock};
 use kinematics::{JointState, Stamp};
@@ -13,12 +14,10 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Most of the bus that asking and answering may take: errors are repeated, and others may speak too.
-const MAX_LOAD_FRAC: f64 = 0.7;
 /// How soon a bus's thread notices that it is to stop, where no cycle is due before.
 const POLL: Duration = Duration::from_millis(50);
 /// Readings that may wait for a slow caller: a second of seven motors at 1 kHz.
-const MAX_WAITING: usize = 7000;
+pub(super) const MAX_WAITING: usize = 7000;
 /// A motor that says nothing for so long while the others do is told.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
 
@@ -30,14 +29,6 @@ pub struct CanArm {
     joints: Joints,
     stop: Arc<AtomicBool>,
     threads: Vec<JoinHandle<()>>,
-}
-
-/// What a motor told.
-#[derive(Debug)]
-struct Told {
-    joint_ix: usize,
-    stamp: Stamp,
-    reading: Reading,
 }
 
 impl CanArm {
@@ -102,35 +93,6 @@ impl Drop for CanArm {
     }
 }
 
-/// The newest readings of all joints.
-#[derive(Debug)]
-struct Joints {
-    newest: Vec<Option<(Stamp, Reading)>>,
-}
-
-impl Joints {
-    fn new(n: usize) -> Self {
-        Self { newest: vec![None; n] }
-    }
-
-    /// Takes a reading; gives a state and begins anew once every joint has one.
-    fn take(&mut self, told: &Told) -> Option<JointState> {
-        self.newest[told.joint_ix] = Some((told.stamp, told.reading));
-        let all = self.newest.iter().copied().collect::<Option<Vec<_>>>()?;
-        self.newest.fill(None);
-        let stamp = all.iter().map(|(stamp, _)| *stamp).max()?;
-        let at = |(then, reading): &(Stamp, Reading)| {
-            reading.position_rad + reading.velocity_rad_s * stamp.secs_since(*then)
-        };
-        Some(JointState {
-            stamp,
-            position: all.iter().map(at).collect(),
-            velocity: all.iter().map(|(_, reading)| reading.velocity_rad_s).collect(),
-            effort: all.iter().map(|(_, reading)| reading.effort_nm).collect::<Option<_>>().unwrap_or_default(),
-        })
-    }
-}
-
 /// What is sent again and again on a bus.
 #[derive(Debug)]
 struct Cycle {
@@ -145,31 +107,19 @@ impl Cycle {
         if motors.iter().any(|(_, motor)| motor.wants_sync()) {
             questions.push(canopen::encode_sync());
         }
-        let worst = |frame: &Frame| frame.bits(Stuffing::Worst);
-        let mut of_a_cycle: Vec<Bits> = questions.iter().map(worst).collect();
+        let mut of_a_cycle = questions.clone();
         let mut unasked = Vec::new();
         for (answer, own_rate_hz) in motors.iter().map(|(_, motor)| motor.usual_answer()) {
             match own_rate_hz {
-                Some(own_rate_hz) => unasked.push((worst(&answer), own_rate_hz)),
-                None => of_a_cycle.push(worst(&answer)),
+                Some(own_rate_hz) => unasked.push((answer, own_rate_hz)),
+                None => of_a_cycle.push(answer),
             }
         }
-        let unasked = load_frac(unasked, bus.rates());
-        let per_cycle = load_frac(of_a_cycle.iter().map(|bits| (*bits, 1.0)), bus.rates());
-        let most_hz = ((MAX_LOAD_FRAC - unasked) / per_cycle).max(1.0);
-        let asked_hz = rate_hz.min(most_hz);
-        let load = 100.0 * (unasked + per_cycle * if questions.is_empty() { 0.0 } else { asked_hz });
-        let interface = &bus.interface;
-        if asked_hz < rate_hz && !questions.is_empty() {
-            log::warn!(
-                "{interface}: {} motors at {rate_hz} Hz would take more than {:.0} % of the bus; they are asked at {asked_hz:.0} Hz \
-                 ({load:.0} %): a second bus or FD makes room",
-                motors.len(),
-                100.0 * MAX_LOAD_FRAC
-            );
-        } else {
-            log::info!("{interface}: {} motors take {load:.0} % of the bus at most", motors.len());
-        }
+        let asked_hz = match questions.is_empty() {
+            // Nobody is asked; what comes, comes as often as the motors have it.
+            true => rate_hz,
+            false => affordable_hz(bus, &of_a_cycle, &unasked, rate_hz),
+        };
         Self { questions, period: Duration::from_secs_f64(1.0 / asked_hz) }
     }
 }
@@ -261,25 +211,6 @@ impl Line {
 mod tests {
     use super::super::config::{Family, MotorConfig};
     use super::*;
-
-    fn told(joint_ix: usize, millis: i64, position_rad: f64) -> Told {
-        let reading = Reading { position_rad, velocity_rad_s: 2.0, effort_nm: Some(0.5) };
-        Told { joint_ix, stamp: Stamp(millis * 1_000_000), reading }
-    }
-
-    #[test]
-    fn a_state_waits_for_all_joints_and_carries_them_on_to_the_newest() {
-        let mut joints = Joints::new(3);
-        assert_eq!(joints.take(&told(0, 1, 0.0)), None);
-        assert_eq!(joints.take(&told(2, 2, 0.2)), None);
-        assert_eq!(joints.take(&told(0, 3, 0.1)), None, "the newer one counts");
-        let state = joints.take(&told(1, 5, 0.3)).unwrap();
-        assert_eq!(state.stamp, Stamp(5_000_000));
-        let expected = [0.1 + 2.0 * 0.002, 0.3, 0.2 + 2.0 * 0.003];
-        assert!(state.position.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-12));
-        assert_eq!((state.velocity, state.effort), (vec![2.0; 3], vec![0.5; 3]));
-        assert_eq!(joints.take(&told(1, 6, 0.3)), None, "it begins anew");
-    }
 
     #[test]
     fn the_rate_keeps_the_load_of_a_classic_bus_under_seventy_percent() {

@@ -127,6 +127,18 @@ impl Bus {
         }
     }
 
+    /// Sends a frame, or not where the interface's queue is full: what is of this instant only must not wait.
+    pub fn try_send(&self, frame: &Frame) -> Result<bool, Error> {
+        match self.write(frame) {
+            Ok(()) => {
+                self.count(frame);
+                Ok(true)
+            }
+            Err(error) if error.raw_os_error() == Some(ENOBUFS) || error.should_retry() => Ok(false),
+            Err(source) => Err(self.refused(source)),
+        }
+    }
+
     fn write(&self, frame: &Frame) -> io::Result<()> {
         let id = socket_id(frame.id());
         let unfit = || io::Error::from(io::ErrorKind::InvalidInput);
@@ -142,11 +154,17 @@ impl Bus {
         self.socket.write_frame(&CanDataFrame::new(id, frame.data()).ok_or_else(unfit)?)
     }
 
+    /// Waits until something came on any of them, or the time is over.
+    pub fn wait_for_any(buses: &[Self], timeout: Duration) {
+        let mut polled: Vec<_> = buses.iter().map(|bus| PollFd::new(&bus.socket, PollFlags::IN)).collect();
+        // What is wrong with a bus is told where it is read.
+        let _ = poll(&mut polled, Some(&timespec(timeout)));
+    }
+
     /// Waits for what comes next; `None` where nothing came.
     pub fn receive(&self, timeout: Duration) -> Result<Option<(Stamp, Arrived)>, Error> {
         // A receive timeout of the socket counts in jiffies, up to 10 ms each; that of ppoll is fine.
-        let timeout = Timespec { tv_sec: saturated(timeout.as_secs()), tv_nsec: timeout.subsec_nanos().into() };
-        match poll(&mut [PollFd::new(&self.socket, PollFlags::IN)], Some(&timeout)) {
+        match poll(&mut [PollFd::new(&self.socket, PollFlags::IN)], Some(&timespec(timeout))) {
             Ok(0) | Err(Errno::INTR) => return Ok(None),
             Ok(_) => {}
             Err(error) => return Err(self.refused(error.into())),
@@ -181,8 +199,8 @@ impl Bus {
     }
 }
 
-fn saturated(seconds: u64) -> i64 {
-    i64::try_from(seconds).unwrap_or(i64::MAX)
+fn timespec(timeout: Duration) -> Timespec {
+    Timespec { tv_sec: i64::try_from(timeout.as_secs()).unwrap_or(i64::MAX), tv_nsec: timeout.subsec_nanos().into() }
 }
 
 fn socket_id(id: Id) -> SocketId {

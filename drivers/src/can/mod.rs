@@ -1,7 +1,9 @@
-//! Arms whose joints are motors on CAN buses: Linux sockets, one thread a bus. Nothing here commands a motor.
+//! Arms whose joints are motors on CAN buses, over Linux sockets.
 //!
-//! `link` checks how an interface is set up, `bus` moves frames and counts what is wrong on the wire, `motor` speaks to one motor
-//! of any family, `arm` makes joint states of what all of them say. `played` is the other side: motors for tests and simulators.
+//! `link` checks how an interface is set up, `bus` moves frames and counts what is wrong on the wire. `motor` reads one motor of any
+//! family, `arm` makes joint states of what all of them say, a thread a bus; nothing in these two commands a motor. `mover` is a motor
+//! that may be moved, `watchdog` what it does when this computer falls silent, `movable` an arm of them, with `moving` as its thread.
+//! `played` is the other side: motors for tests and simulators.
 
 #[cfg(target_os = "linux")]
 mod arm;
@@ -10,10 +12,24 @@ mod bus;
 mod config;
 mod interfaces;
 #[cfg(target_os = "linux")]
+mod joints;
+#[cfg(target_os = "linux")]
 mod link;
 #[cfg(target_os = "linux")]
 mod motor;
+#[cfg(target_os = "linux")]
+mod movable;
+#[cfg(target_os = "linux")]
+mod mover;
+#[cfg(target_os = "linux")]
+mod moving;
+#[cfg(target_os = "linux")]
+mod pace;
 pub mod played;
+#[cfg(target_os = "linux")]
+mod talk;
+#[cfg(target_os = "linux")]
+mod watchdog;
 
 #[cfg(target_os = "linux")]
 pub use arm::CanArm;
@@ -23,6 +39,8 @@ pub use config::{ArmConfig, BusConfig, Family, Gains, MotorConfig};
 pub use interfaces::interfaces;
 #[cfg(target_os = "linux")]
 pub use link::{Complaint, Link, State};
+#[cfg(target_os = "linux")]
+pub use movable::{MovableArmConfig, MovableCanArm};
 
 /// Our number among Robstride hosts, as in the maker's program.
 const ROBSTRIDE_HOST: u8 = 0xFD;

@@ -5,22 +5,18 @@
 //! commanded, and a command without gains would make it limp: so it is only listened to, while another master commands it.
 
 use super::ROBSTRIDE_HOST;
-use super::bus::{Arrived, Bus, WireErrors};
+use super::bus::Bus;
 use super::config::{Family, MotorConfig};
-use crate::wire::can::canopen::{self, Direction, Nmt, NodeState, Object, Pdo, SdoAnswer};
+use super::talk::Talk;
+use crate::Error;
+use crate::wire::can::canopen::{self, Direction, Nmt, NodeState, Object, Pdo};
 use crate::wire::can::damiao::{self, Access, Register, RegisterMessage, Value};
 use crate::wire::can::mit::Limits;
 use crate::wire::can::robstride::{self, Parameter, Request};
 use crate::wire::can::tmotor::{self, Thermometer};
-use crate::wire::can::{CanError, Frame, Id, cia402, odrive};
-use crate::{Error, clock};
-use std::cell::Cell;
+use crate::wire::can::{Frame, Id, cia402, odrive};
 use std::time::Duration;
 
-/// How long an answer may take; on a full bus at 1 Mbit/s a frame waits for some milliseconds.
-const MAX_ANSWER: Duration = Duration::from_millis(50);
-/// How often a question is asked before the motor counts as silent.
-const MAX_ASKED: usize = 4;
 /// How long a motor that reports by itself may take to do so.
 const MAX_REPORT: Duration = Duration::from_secs(1);
 /// Value of [`Parameter::ReportInterval`] for the shortest interval there is.
@@ -54,12 +50,16 @@ pub(super) struct Motor {
 impl Motor {
     /// Asks the motor for what its counts cover, and has it report.
     pub(super) fn set_up(bus: &Bus, config: &MotorConfig) -> Result<Self, Error> {
-        let talk = Talk { bus, config, errors: Cell::default() };
-        let mut motor = Self { config: config.clone(), limits: Limits::of(1.0, 1.0, 1.0) };
+        let talk = Talk::new(bus, config);
+        let mut motor = Self::with_limits(config.clone(), Limits::of(1.0, 1.0, 1.0));
         match config.family {
             Family::Damiao { motor: number, feedback } => {
-                let [p_max, v_max, t_max] = [Register::PositionLimit, Register::VelocityLimit, Register::TorqueLimit]
-                    .map(|register| talk.register(number, feedback, register));
+                let real = |register| match talk.register(number, feedback, register)? {
+                    Value::Real(real) => Ok(real),
+                    Value::Whole(_) => Err(talk.fault(format!("register {register:?} holds no real number"))),
+                };
+                let [p_max, v_max, t_max] =
+                    [Register::PositionLimit, Register::VelocityLimit, Register::TorqueLimit].map(real);
                 motor.limits = talk.said(damiao::limits_from_registers(p_max?, v_max?, t_max?))?;
                 log::debug!("{}: counts cover {:?}", talk.name(), motor.limits);
             }
@@ -67,8 +67,7 @@ impl Motor {
                 motor.limits = model.limits();
                 let interval = Request::Write(Parameter::ReportInterval, robstride::Value::Whole(SHORTEST_REPORT));
                 for request in [interval, Request::ReportActively(true)] {
-                    let request = robstride::encode_request(ROBSTRIDE_HOST, number, &request, &motor.limits);
-                    bus.send(&talk.said(request)?)?;
+                    talk.robstride(number, &request, &motor.limits)?;
                 }
                 motor
                     .hear(&talk, "it does not report; is its number right, and its firmware one with active report?")?;
@@ -89,13 +88,24 @@ impl Motor {
         Ok(motor)
     }
 
-    #[cfg(test)]
+    /// One whose counts cover so much.
     pub(super) fn with_limits(config: MotorConfig, limits: Limits) -> Self {
         Self { config, limits }
     }
 
     pub(super) fn config(&self) -> &MotorConfig {
         &self.config
+    }
+
+    /// What its counts cover, where it has counts.
+    pub(super) fn limits(&self) -> &Limits {
+        &self.limits
+    }
+
+    /// How far the joint turns in a turn of the motor, negative where it turns the other way.
+    pub(super) fn per_turn(&self) -> f64 {
+        let direction = if self.config.is_reversed { -1.0 } else { 1.0 };
+        direction / self.config.gear_ratio
     }
 
     /// What is sent in each cycle so that it tells where it is; `None` where it tells unasked, or at a SYNC.
@@ -168,8 +178,7 @@ impl Motor {
                 (units.rad_from_raw(position), units.rad_from_raw(velocity), None)
             }
         };
-        let direction = if self.config.is_reversed { -1.0 } else { 1.0 };
-        let per_turn = direction / self.config.gear_ratio;
+        let per_turn = self.per_turn();
         Some(Reading {
             position_rad: position * per_turn + self.config.offset_rad,
             velocity_rad_s: velocity * per_turn,
@@ -188,118 +197,39 @@ fn is_register(frame: &Frame, motor: u16) -> bool {
     damiao::decode_register(frame).is_ok_and(|message| message.motor == motor)
 }
 
-/// A conversation with one motor while nothing else reads the bus.
-struct Talk<'a> {
-    bus: &'a Bus,
-    config: &'a MotorConfig,
-    errors: Cell<WireErrors>,
-}
-
-impl Talk<'_> {
-    fn name(&self) -> String {
-        format!("joint {:?} on {:?}", self.config.joint, self.bus.config().interface)
-    }
-
-    fn fault(&self, reason: impl Into<String>) -> Error {
-        let interface = self.bus.config().interface.clone();
-        Error::Motor { joint: self.config.joint.clone(), interface, reason: reason.into() }
-    }
-
-    /// What a codec said, as an error of this motor.
-    fn said<T>(&self, result: Result<T, CanError>) -> Result<T, Error> {
-        result.map_err(|error| self.fault(error.to_string()))
-    }
-
-    /// The first frame within a time that `answers`.
-    fn wait<T>(&self, within: Duration, mut answers: impl FnMut(&Frame) -> Option<T>) -> Result<Option<T>, Error> {
-        let until = clock::now() + within;
-        loop {
-            let left = until.duration_since(clock::now());
-            if left.is_zero() {
-                return Ok(None);
-            }
-            match self.bus.receive(left)? {
-                Some((_, Arrived::Frame(frame))) => {
-                    if let Some(answer) = answers(&frame) {
-                        return Ok(Some(answer));
-                    }
-                }
-                Some((_, Arrived::Errors(more))) => {
-                    let mut errors = self.errors.get();
-                    errors.add(&more);
-                    self.errors.set(errors);
-                }
-                None => {}
-            }
-        }
-    }
-
-    /// Asks until an answer comes, some times.
-    fn ask<T>(&self, question: &Frame, mut answers: impl FnMut(&Frame) -> Option<T>) -> Result<T, Error> {
-        for _ in 0..MAX_ASKED {
-            self.bus.send(question)?;
-            if let Some(answer) = self.wait(MAX_ANSWER, &mut answers)? {
-                return Ok(answer);
-            }
-        }
-        let errors = self.errors.get();
-        Err(self.fault(match errors.n_unacknowledged + errors.n_bus_off {
-            0 => format!("no answer to {MAX_ASKED} questions; is the motor powered and its number right?"),
-            _ => "nobody acknowledges frames: the others are off, at another bit rate, or the bus is cut or not terminated"
-                .to_owned(),
-        }))
-    }
-
-    /// Reads a register of a Damiao motor that holds a real number.
-    fn register(&self, motor: u16, feedback: u16, register: Register) -> Result<f32, Error> {
-        let question = RegisterMessage { motor, access: Access::Read(register) };
-        let question = self.said(damiao::encode_register(&question, None))?;
-        let answer_id = self.said(Id::standard(feedback.into()))?;
-        self.ask(&question, |frame| match damiao::decode_register(frame) {
-            Ok(RegisterMessage { motor: from, access: Access::Told(told, Value::Real(value)) })
-                if frame.id() == answer_id && from == motor && told == register =>
-            {
-                Some(value)
-            }
-            _ => None,
-        })
-    }
-
-    /// Sets an object of a CANopen node.
-    fn set(&self, node: canopen::Node, object: Object, value: i64) -> Result<(), Error> {
-        let question = self.said(canopen::encode_write(node, object, value))?;
-        let answer = self.ask(&question, |frame| match canopen::decode_sdo(frame) {
-            Ok((from, SdoAnswer::Written { index, subindex })) => {
-                (from == node && (index, subindex) == (object.index, object.subindex)).then_some(Ok(()))
-            }
-            Err(error @ CanError::Aborted { index, .. }) => (index == object.index).then_some(Err(error)),
-            _ => None,
-        })?;
-        self.said(answer)
-    }
-}
-
 /// Has a drive send position and velocity at every SYNC, and starts it; it stays switched off.
+fn set_up_drive(talk: &Talk<'_>, node: canopen::Node) -> Result<(), Error> {
+    let mut entries = every_sync(Pdo::First, Direction::Transmit, node, &[cia402::POSITION, cia402::VELOCITY]);
+    entries.push((canopen::PRODUCER_HEARTBEAT, HEARTBEAT_MILLIS));
+    start_drive(talk, node, &entries)
+}
+
+/// The entries that lay objects into a PDO of a drive and have it sent, or taken, at every SYNC.
 ///
 /// Source: CiA 301, section 7.5.2.36: a PDO is switched off while its mapping is changed.
-fn set_up_drive(talk: &Talk<'_>, node: canopen::Node) -> Result<(), Error> {
-    let pdo = |entry| Pdo::First.communication(Direction::Transmit, entry);
-    let place = |place| Pdo::First.mapping(Direction::Transmit, place);
-    let id = i64::from(Pdo::First.id(Direction::Transmit, node).value());
-    talk.bus.send(&canopen::encode_nmt(Nmt::EnterPreOperational, Some(node)))?;
-    for (object, value) in [
-        (pdo(1), id | PDO_OFF),
-        (place(0), 0),
-        (place(1), cia402::POSITION.mapped().into()),
-        (place(2), cia402::VELOCITY.mapped().into()),
-        (place(0), 2),
-        (pdo(2), EVERY_SYNC),
-        (pdo(1), id),
-        (canopen::PRODUCER_HEARTBEAT, HEARTBEAT_MILLIS),
-    ] {
-        talk.set(node, object, value)?;
+pub(super) fn every_sync(
+    pdo: Pdo,
+    direction: Direction,
+    node: canopen::Node,
+    objects: &[Object],
+) -> Vec<(Object, i64)> {
+    let id = i64::from(pdo.id(direction, node).value());
+    let mut entries = vec![(pdo.communication(direction, 1), id | PDO_OFF), (pdo.mapping(direction, 0), 0)];
+    for (place, object) in (1..).zip(objects) {
+        entries.push((pdo.mapping(direction, place), object.mapped().into()));
     }
-    talk.bus.send(&canopen::encode_nmt(Nmt::Start, Some(node)))?;
+    entries.push((pdo.mapping(direction, 0), i64::try_from(objects.len()).expect("at most eight")));
+    entries.extend([(pdo.communication(direction, 2), EVERY_SYNC), (pdo.communication(direction, 1), id)]);
+    entries
+}
+
+/// Sets entries while a drive's PDOs rest, and starts these.
+pub(super) fn start_drive(talk: &Talk<'_>, node: canopen::Node, entries: &[(Object, i64)]) -> Result<(), Error> {
+    talk.send(Ok(canopen::encode_nmt(Nmt::EnterPreOperational, Some(node))))?;
+    for (object, value) in entries {
+        talk.set(node, *object, *value)?;
+    }
+    talk.send(Ok(canopen::encode_nmt(Nmt::Start, Some(node))))?;
     let started = talk.wait(MAX_REPORT, |frame| match canopen::decode_heartbeat(frame) {
         Ok((from, NodeState::Operational)) => (from == node).then_some(()),
         _ => None,

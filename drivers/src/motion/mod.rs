@@ -59,6 +59,17 @@ pub enum OnLoss {
     Release,
 }
 
+impl OnLoss {
+    /// As rig files have it.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Hold => "hold",
+            Self::Damp => "damp",
+            Self::Release => "release",
+        }
+    }
+}
+
 /// How an arm may be moved, as the rig file has it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MotionConfig {

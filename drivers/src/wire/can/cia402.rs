@@ -10,6 +10,20 @@ use std::f64::consts::TAU;
 
 /// What the drive does when the host is gone: 0 nothing, 1 fault, 2 switch off, 3 quick stop.
 pub const ABORT_CONNECTION: Object = Object { index: 0x6007, subindex: 0, n_bytes: 2 };
+/// What it does at a quick stop: 0 let go, 1 to 3 stop and let go, 5 to 7 stop and stay, [`STAY_STOPPED`] by its quick-stop ramp.
+pub const QUICK_STOP_OPTION: Object = Object { index: 0x605A, subindex: 0, n_bytes: 2 };
+/// Value of [`QUICK_STOP_OPTION`]: slow down on the quick-stop ramp and stay in [`State::QuickStopActive`].
+pub const STAY_STOPPED: i64 = 6;
+/// Value of [`ABORT_CONNECTION`]: the order [`Order::DisableVoltage`].
+pub const ABORT_BY_DISABLING: i64 = 2;
+/// Value of [`ABORT_CONNECTION`]: the order [`Order::QuickStop`].
+pub const ABORT_BY_QUICK_STOP: i64 = 3;
+/// Modes that it has, a bit each: [`Mode`] `n` is bit `n - 1`.
+pub const SUPPORTED_MODES: Object = Object { index: 0x6502, subindex: 0, n_bytes: 4 };
+/// How often targets come in a cyclic mode, in units of ten to the power of [`INTERPOLATION_EXPONENT`] seconds.
+pub const INTERPOLATION_PERIOD: Object = Object { index: 0x60C2, subindex: 1, n_bytes: 1 };
+/// See [`INTERPOLATION_PERIOD`]; -3 is milliseconds.
+pub const INTERPOLATION_EXPONENT: Object = Object { index: 0x60C2, subindex: 2, n_bytes: 1 };
 /// Orders, [`Order::controlword`].
 pub const CONTROLWORD: Object = Object { index: 0x6040, subindex: 0, n_bytes: 2 };
 /// State, [`State::from_statusword`].
@@ -91,6 +105,13 @@ pub enum Order {
     QuickStop,
     /// From [`State::Fault`] to [`State::SwitchOnDisabled`]; counts when bit 7 rises, so another order must come before.
     ResetFault,
+}
+
+impl Mode {
+    /// Whether [`SUPPORTED_MODES`] has it.
+    pub fn is_in(self, supported: u32) -> bool {
+        supported >> (self as i8 - 1) & 1 == 1
+    }
 }
 
 impl Order {
@@ -291,6 +312,7 @@ mod tests {
         assert_eq!(enable.data(), [0x2B, 0x40, 0x60, 0, 0x0F, 0, 0, 0]);
         let mode = encode_write(node, MODE, Mode::CyclicPosition as i64).expect("8 bits");
         assert_eq!(mode.data(), [0x2F, 0x60, 0x60, 0, 8, 0, 0, 0]);
+        assert!(Mode::CyclicPosition.is_in(0x80) && !Mode::CyclicPosition.is_in(!0x80));
     }
 
     #[test]

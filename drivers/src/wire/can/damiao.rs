@@ -12,6 +12,8 @@ use super::{CanError, Frame, Id, defined, eight};
 const REGISTER_ID: u32 = 0x7FF;
 /// Seconds of one count of register `TIMEOUT`.
 const TIMEOUT_TICK_SECS: f64 = 50e-6;
+/// Value of [`Register::ControlMode`] in which commands are those of MIT mode.
+pub const MIT_MODE: u32 = 1;
 /// How messages that come from a motor are called in errors.
 const FEEDBACK: &str = "feedback of a Damiao motor";
 const REGISTER: &str = "register message of a Damiao motor";

@@ -4,13 +4,21 @@
 //! firmware 0.6.10 (heartbeat, errors, torques, endpoints, temperature). Turns on the wire are radians here. What a node tells
 //! comes by itself at the rates set in its `can.config` or `axis.config.can`, or when asked with a remote frame.
 
+mod endpoints;
+
+pub use endpoints::{Endpoints, EndpointsError};
+
 use super::{CanError, Frame, Id, defined};
 use std::f64::consts::TAU;
 
+/// First byte of `Get_Version`'s answer.
+const PROTOCOL_VERSION: u8 = 2;
 /// How frames of a node are called in errors.
 const MESSAGE: &str = "ODrive message";
 /// Feed-forward counts: thousandths of a turn a second, and of a newton metre.
 const FEED_FORWARD: f64 = 1e-3;
+/// Bit of [`Answer::Heartbeat`]'s errors: no command came for longer than the axis' watchdog allows.
+pub const WATCHDOG_TIMER_EXPIRED: u32 = 1 << 24;
 
 /// Number of an axis on the bus, 0 to 62; 63 is a node without one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -35,6 +43,8 @@ impl Node {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Code {
+    /// `Get_Version`.
+    Version = 0x00,
     /// `Heartbeat`.
     Heartbeat = 0x01,
     /// `Estop`.
@@ -158,6 +168,13 @@ pub enum Request {
 /// What a node sends.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Answer {
+    /// What it is and what runs on it.
+    Version {
+        /// Product line, version and variant.
+        hardware: [u8; 3],
+        /// Major, minor and revision.
+        firmware: [u8; 3],
+    },
     /// That it lives.
     Heartbeat {
         /// What is wrong, bits of the firmware's `ODrive.Error`.
@@ -247,7 +264,9 @@ pub fn decode_answer(frame: &Frame) -> Result<(Node, Answer), CanError> {
         }
     };
     let is = |code: Code| low & 0x1F == code as u8;
-    let answer = if is(Code::Heartbeat) {
+    let answer = if is(Code::Version) {
+        Answer::Version { hardware: [b, c, d], firmware: [e, f, g] }
+    } else if is(Code::Heartbeat) {
         let state = defined("the state of the axis", e.into(), &State::ALL, |known| known as u32)?;
         Answer::Heartbeat { errors: words.0, state }
     } else if is(Code::Errors) {
@@ -272,6 +291,9 @@ pub fn decode_answer(frame: &Frame) -> Result<(Node, Answer), CanError> {
 /// The frame of what a node sends, for axes that are simulated.
 pub fn encode_answer(node: Node, answer: &Answer) -> Result<Frame, CanError> {
     let (code, halves) = match *answer {
+        Answer::Version { hardware: [b, c, d], firmware: [e, f, g] } => {
+            (Code::Version, [[PROTOCOL_VERSION, b, c, d], [e, f, g, 0]])
+        }
         Answer::Heartbeat { errors, state } => (Code::Heartbeat, [errors.to_le_bytes(), [state as u8, 0, 0, 0]]),
         Answer::Errors { active, disarm_reason } => (Code::Errors, [active.to_le_bytes(), disarm_reason.to_le_bytes()]),
         Answer::Endpoint(number, value) => {
@@ -342,6 +364,7 @@ mod tests {
     #[test]
     fn answers_are_read_and_made_again() {
         for (bytes, expected) in [
+            (frame(0x020, &[2, 4, 4, 58, 0, 6, 9, 0]), Answer::Version { hardware: [4, 4, 58], firmware: [0, 6, 9] }),
             (
                 frame(0x021, &[1, 0, 0, 0x80, 8, 0, 0, 0]),
                 Answer::Heartbeat { errors: 0x8000_0001, state: State::ClosedLoopControl },

@@ -15,6 +15,8 @@ use std::f64::consts::PI;
 
 /// How frames that come from a motor are called in errors.
 const MESSAGE: &str = "answer of a Robstride motor";
+/// Value of [`Parameter::RunMode`] in which [`Request::Move`] is obeyed.
+pub const MOTION_MODE: u32 = 0;
 /// What some orders carry so that nothing else is taken for them.
 const SEAL: [u8; 6] = [1, 2, 3, 4, 5, 6];
 /// The number that a motor's answer to [`Request::Identify`] goes to.
@@ -203,6 +205,23 @@ pub fn encode_request(host: u8, motor: u8, request: &Request, limits: &Limits) -
     Frame::classic(id_of(kind, middle, motor)?, &bytes)
 }
 
+/// Reads a request to move that is for motor `motor`: what a simulated motor gets.
+pub fn decode_move(frame: &Frame, motor: u8, limits: &Limits) -> Option<Command> {
+    let [a, b, c, d, e, f, g, h] = eight(frame, MESSAGE, true).ok()?;
+    let [kind, t1, t0, to] = frame.id().value().to_be_bytes();
+    if kind != Communication::Motion as u8 || to != motor {
+        return None;
+    }
+    let scales = Scales::with_bits(limits, 16);
+    Some(Command {
+        position_rad: scales.position.value_from_raw(u16::from_be_bytes([a, b])),
+        velocity_rad_s: scales.velocity.value_from_raw(u16::from_be_bytes([c, d])),
+        kp_nm_rad: scales.kp.value_from_raw(u16::from_be_bytes([e, f])),
+        kd_nm_s_rad: scales.kd.value_from_raw(u16::from_be_bytes([g, h])),
+        torque_nm: scales.torque.value_from_raw(u16::from_be_bytes([t1, t0])),
+    })
+}
+
 /// Reads what a motor sends to host number `host`.
 pub fn decode_answer(frame: &Frame, host: u8, limits: &Limits) -> Result<Answer, CanError> {
     let bytes = eight(frame, MESSAGE, true)?;
@@ -306,6 +325,21 @@ mod tests {
         ] {
             assert_eq!(encode_request(HOST, 0x7F, &request, &LIMITS), Ok(frame(id, bytes)), "{request:?}");
         }
+    }
+
+    #[test]
+    fn a_request_to_move_comes_back() {
+        let command =
+            Command { position_rad: 1.5, velocity_rad_s: -3.0, kp_nm_rad: 60.0, kd_nm_s_rad: 1.25, torque_nm: 0.5 };
+        let sent = encode_request(HOST, 5, &Request::Move(command), &LIMITS).expect("numbers");
+        let got = decode_move(&sent, 5, &LIMITS).expect("it is for it");
+        // Half a count of 16 bits each.
+        assert!((got.position_rad - 1.5).abs() < 2e-4 && (got.velocity_rad_s + 3.0).abs() < 6e-4);
+        assert!((got.kp_nm_rad - 60.0).abs() < 4e-3 && (got.kd_nm_s_rad - 1.25).abs() < 4e-5);
+        assert!((got.torque_nm - 0.5).abs() < 3e-4);
+        assert_eq!(decode_move(&sent, 6, &LIMITS), None);
+        let enable = encode_request(HOST, 5, &Request::Enable, &LIMITS).expect("no numbers");
+        assert_eq!(decode_move(&enable, 5, &LIMITS), None);
     }
 
     #[test]

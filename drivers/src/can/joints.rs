@@ -1,0 +1,65 @@
+//! States of all joints, made of what single motors tell.
+
+use super::motor::Reading;
+use kinematics::{JointState, Stamp};
+
+/// What a motor told.
+#[derive(Debug)]
+pub(super) struct Told {
+    pub(super) joint_ix: usize,
+    pub(super) stamp: Stamp,
+    pub(super) reading: Reading,
+}
+
+/// The newest readings of all joints.
+#[derive(Debug)]
+pub(super) struct Joints {
+    newest: Vec<Option<(Stamp, Reading)>>,
+}
+
+impl Joints {
+    pub(super) fn new(n: usize) -> Self {
+        Self { newest: vec![None; n] }
+    }
+
+    /// Takes a reading; gives a state and begins anew once every joint has one.
+    pub(super) fn take(&mut self, told: &Told) -> Option<JointState> {
+        self.newest[told.joint_ix] = Some((told.stamp, told.reading));
+        let all = self.newest.iter().copied().collect::<Option<Vec<_>>>()?;
+        self.newest.fill(None);
+        let stamp = all.iter().map(|(stamp, _)| *stamp).max()?;
+        let at = |(then, reading): &(Stamp, Reading)| {
+            reading.position_rad + reading.velocity_rad_s * stamp.secs_since(*then)
+        };
+        Some(JointState {
+            stamp,
+            position: all.iter().map(at).collect(),
+            velocity: all.iter().map(|(_, reading)| reading.velocity_rad_s).collect(),
+            effort: all.iter().map(|(_, reading)| reading.effort_nm).collect::<Option<_>>().unwrap_or_default(),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn told(joint_ix: usize, millis: i64, position_rad: f64) -> Told {
+        let reading = Reading { position_rad, velocity_rad_s: 2.0, effort_nm: Some(0.5) };
+        Told { joint_ix, stamp: Stamp(millis * 1_000_000), reading }
+    }
+
+    #[test]
+    fn a_state_waits_for_all_joints_and_carries_them_on_to_the_newest() {
+        let mut joints = Joints::new(3);
+        assert_eq!(joints.take(&told(0, 1, 0.0)), None);
+        assert_eq!(joints.take(&told(2, 2, 0.2)), None);
+        assert_eq!(joints.take(&told(0, 3, 0.1)), None, "the newer one counts");
+        let state = joints.take(&told(1, 5, 0.3)).unwrap();
+        assert_eq!(state.stamp, Stamp(5_000_000));
+        let expected = [0.1 + 2.0 * 0.002, 0.3, 0.2 + 2.0 * 0.003];
+        assert!(state.position.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-12));
+        assert_eq!((state.velocity, state.effort), (vec![2.0; 3], vec![0.5; 3]));
+        assert_eq!(joints.take(&told(1, 6, 0.3)), None, "it begins anew");
+    }
+}

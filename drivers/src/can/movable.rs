@@ -1,0 +1,133 @@
+//! An arm of motors on CAN buses that may be moved.
+//!
+//! One thread speaks to all buses of the arm, so that its joints set out and arrive together. In each cycle it sends every motor where
+//! to be, which is also what keeps the motors' own watchdogs quiet.
+
+use super::arm::MAX_WAITING;
+use super::config::ArmConfig;
+use super::joints::{Joints, Told};
+use super::moving::{Moving, Request};
+use crate::motion::{JointTarget, Motion, MotionConfig, MovableArm};
+use crate::wire::can::odrive::Endpoints;
+use crate::{Arm, Error};
+use kinematics::JointState;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+/// How long the arm's thread may take to answer: it looks for requests once a cycle.
+const MAX_ANSWER: Duration = Duration::from_secs(1);
+/// Making motors ready and switching them on takes some hundred milliseconds a motor.
+const MAX_RECOVERY: Duration = Duration::from_secs(60);
+
+/// An arm as the rig file has it, and how it may be moved.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MovableArmConfig {
+    /// Buses and motors; those in MIT mode need their gains.
+    pub arm: ArmConfig,
+    /// Limits of each joint, in the order of the motors, and what happens when this computer falls silent.
+    pub motion: MotionConfig,
+    /// Numbers of the endpoints of `ODrive` axes, without which their watchdog cannot be set.
+    pub odrive_endpoints: Option<Endpoints>,
+}
+
+/// An arm that is held where it was found, and may be moved.
+///
+/// Dropping it brings it to rest within its limits; then each motor is told what `on_loss` says.
+#[derive(Debug)]
+pub struct MovableCanArm {
+    names: Vec<String>,
+    arriving: Receiver<Result<Told, Error>>,
+    joints: Joints,
+    requests: SyncSender<Request>,
+    motion: Arc<Mutex<Motion>>,
+    is_ending: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl MovableCanArm {
+    /// Checks what the motors can do, sets their timeouts and reads them back, and switches them on, held where they are.
+    ///
+    /// Where anything fails, all of them are left switched off.
+    pub fn open(config: &MovableArmConfig) -> Result<Self, Error> {
+        let names: Vec<String> = config.arm.motors.iter().map(|motor| motor.joint.clone()).collect();
+        let (sender, arriving) = sync_channel(MAX_WAITING);
+        let (requests, requested) = sync_channel(1);
+        let motion = Arc::new(Mutex::new(Motion::Stopped { reason: "it was not switched on yet".to_owned() }));
+        let is_ending = Arc::new(AtomicBool::new(false));
+        let moving = Moving::new(config, requested, sender, Arc::clone(&motion), Arc::clone(&is_ending))?;
+        let device = "moved CAN arm".to_owned();
+        let thread = std::thread::Builder::new().name(device.clone()).spawn(move || moving.run());
+        let thread = Some(thread.map_err(|source| Error::Thread { device, source })?);
+        let joints = Joints::new(names.len());
+        let mut arm = Self { names, arriving, joints, requests, motion, is_ending, thread };
+        arm.recover()?;
+        Ok(arm)
+    }
+
+    /// Has the arm's thread do something, and waits for what came of it.
+    fn ask<T>(
+        &self,
+        request: impl FnOnce(SyncSender<Result<T, Error>>) -> Request,
+        within: Duration,
+    ) -> Result<T, Error> {
+        let (sender, answer) = sync_channel(1);
+        let gone = || Error::Motion { reason: "its thread does not answer".to_owned() };
+        self.requests.try_send(request(sender)).map_err(|_| gone())?;
+        answer.recv_timeout(within).map_err(|_| gone())?
+    }
+}
+
+impl Arm for MovableCanArm {
+    fn joint_names(&self) -> &[String] {
+        &self.names
+    }
+
+    /// As of [`CanArm`](super::CanArm). An arm that stopped goes on being read where its motors tell without being
+    /// commanded and without a SYNC.
+    fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
+        let until = Instant::now() + timeout;
+        loop {
+            match self.arriving.recv_timeout(until.saturating_duration_since(Instant::now())) {
+                Ok(told) => {
+                    if let Some(state) = self.joints.take(&told?) {
+                        return Ok(state);
+                    }
+                }
+                Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => {
+                    return Err(Error::NoJoints { waited: timeout });
+                }
+            }
+        }
+    }
+}
+
+impl MovableArm for MovableCanArm {
+    fn command(&mut self, target: &JointTarget) -> Result<JointTarget, Error> {
+        self.ask(|answer| Request::HeadFor(target.clone(), answer), MAX_ANSWER)
+    }
+
+    fn motion(&self) -> Motion {
+        self.motion.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    fn stop(&mut self) -> Result<(), Error> {
+        self.ask(Request::Stop, MAX_ANSWER)
+    }
+
+    fn recover(&mut self) -> Result<(), Error> {
+        self.ask(Request::Recover, MAX_RECOVERY)
+    }
+}
+
+impl Drop for MovableCanArm {
+    fn drop(&mut self) {
+        self.is_ending.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            // A thread that panicked has said so.
+            let _ = thread.join();
+        }
+    }
+}

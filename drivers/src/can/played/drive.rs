@@ -1,0 +1,204 @@
+//! A CiA 402 drive with a cyclic synchronous position mode.
+
+use super::shaft::Work;
+use super::{Played, State};
+use crate::wire::can::canopen::{self, CONSUMER_HEARTBEAT, Direction, Node, NodeState, Object, Pdo};
+use crate::wire::can::cia402::{self, Order, Units};
+use crate::wire::can::mit::Command;
+use crate::wire::can::{CanError, Frame, Id};
+use std::time::Duration;
+
+/// What [`cia402::SUPPORTED_MODES`] tells: profile position and the three cyclic modes.
+const MODES: u32 = 0b11_1000_0001;
+
+/// The place of an object among the settings.
+fn number(index: u16, subindex: u8) -> u32 {
+    u32::from(index) << 8 | u32::from(subindex)
+}
+
+/// What a controlword orders; `None` where its bits mean nothing. Source: CiA 402-2, table of the controlword.
+fn order_of(controlword: u16, before: u16) -> Option<Order> {
+    if controlword & !before & 0x80 != 0 {
+        return Some(Order::ResetFault);
+    }
+    match controlword & 0x8F {
+        word if word & 0x82 == 0 => Some(Order::DisableVoltage),
+        word if word & 0x86 == 0x02 => Some(Order::QuickStop),
+        word if word & 0x87 == 0x06 => Some(Order::Shutdown),
+        0x07 => Some(Order::SwitchOn),
+        0x0F => Some(Order::EnableOperation),
+        _ => None,
+    }
+}
+
+impl Played {
+    fn object(&self, object: Object) -> Option<u32> {
+        self.setting(number(object.index, object.subindex))
+    }
+
+    pub(super) fn take_as_drive(&mut self, frame: &Frame, node: Node, units: Units) -> Result<Vec<Frame>, CanError> {
+        if frame.is_remote() || frame.id().is_extended() {
+            return Ok(Vec::new());
+        }
+        let sdo = 0x600 + u32::from(node.number());
+        let watched = self.object(CONSUMER_HEARTBEAT).map_or(0, |entry| entry >> 16 & 0x7F);
+        match (frame.id().value(), frame.data()) {
+            (0, &[order, to]) if to == 0 || to == node.number() => {
+                self.node_state = match order {
+                    0x01 => NodeState::Operational,
+                    0x02 => NodeState::Stopped,
+                    0x80 => NodeState::PreOperational,
+                    _ => NodeState::BootUp,
+                };
+                Ok(Vec::new())
+            }
+            (0x80, &[]) if self.node_state == NodeState::Operational => self.synchronous(node, units),
+            (id, &[_]) if watched > 0 && id == 0x700 + watched => {
+                self.feed();
+                Ok(Vec::new())
+            }
+            (id, &[low, high, a, b, c, d]) if id == Pdo::First.id(Direction::Receive, node).value() => {
+                if self.node_state == NodeState::Operational && self.takes_targets(node) {
+                    self.waiting = Some((u16::from_le_bytes([low, high]), i32::from_le_bytes([a, b, c, d])));
+                }
+                Ok(Vec::new())
+            }
+            (id, &[command, low, high, subindex, a, b, c, d]) if id == sdo => {
+                let index = u16::from_le_bytes([low, high]);
+                let answer = match command >> 5 {
+                    1 => {
+                        let value = u32::from_le_bytes([a, b, c, d]);
+                        let is_timeout = index == CONSUMER_HEARTBEAT.index;
+                        self.set(number(index, subindex), value, is_timeout);
+                        if index == cia402::CONTROLWORD.index {
+                            self.order(u16::from_le_bytes([a, b]), None);
+                        }
+                        [0x60, low, high, subindex, 0, 0, 0, 0]
+                    }
+                    2 => {
+                        let [a, b, c, d] = self.told(index, subindex).to_le_bytes();
+                        [0x43, low, high, subindex, a, b, c, d]
+                    }
+                    _ => return Ok(Vec::new()),
+                };
+                Ok(vec![Frame::classic(Id::standard(0x580 + u32::from(node.number()))?, &answer)?])
+            }
+            _ => Ok(Vec::new()),
+        }
+    }
+
+    /// What an object holds.
+    fn told(&self, index: u16, subindex: u8) -> u32 {
+        let is = |object: Object| object.index == index;
+        if is(cia402::STATUSWORD) {
+            self.drive_state.statusword().into()
+        } else if is(cia402::SUPPORTED_MODES) {
+            MODES
+        } else if is(cia402::MODE_DISPLAY) {
+            self.object(cia402::MODE).unwrap_or(0)
+        } else {
+            self.setting(number(index, subindex)).unwrap_or(0)
+        }
+    }
+
+    /// Whether its first PDO brings controlword and target at every SYNC.
+    fn takes_targets(&self, node: Node) -> bool {
+        let mapped = [cia402::CONTROLWORD, cia402::TARGET_POSITION].map(|object| Some(object.mapped()));
+        let places = [1, 2].map(|place| self.object(Pdo::First.mapping(Direction::Receive, place)));
+        self.is_on(Pdo::First, Direction::Receive, node) && places == mapped
+    }
+
+    fn is_on(&self, pdo: Pdo, direction: Direction, node: Node) -> bool {
+        self.object(pdo.communication(direction, 1)) == Some(pdo.id(direction, node).value())
+            && self.object(pdo.communication(direction, 2)) == Some(1)
+    }
+
+    /// Takes an order, and a target where it obeys in cyclic position mode.
+    fn order(&mut self, controlword: u16, target: Option<Command>) {
+        if let Some(order) = order_of(controlword, self.last_controlword) {
+            self.go_to(self.drive_state.after(order));
+        }
+        self.last_controlword = controlword;
+        let is_cyclic = self.object(cia402::MODE) == Some(cia402::Mode::CyclicPosition as u32);
+        if let Some(target) = target.filter(|_| is_cyclic && self.state() == State::Obeys) {
+            self.work = Work::Follow(target);
+            self.target = Some(target);
+        }
+    }
+
+    fn go_to(&mut self, state: cia402::State) {
+        if state == self.drive_state {
+            return;
+        }
+        self.drive_state = state;
+        self.work = match state {
+            cia402::State::OperationEnabled => {
+                let position_rad = self.shaft.motion.position_rad;
+                Work::Follow(Command { position_rad, ..Command::default() })
+            }
+            cia402::State::QuickStopActive => match self.object(cia402::QUICK_STOP_OPTION) {
+                Some(5..=7) => Work::Stop,
+                _ => {
+                    self.drive_state = cia402::State::SwitchOnDisabled;
+                    Work::Free
+                }
+            },
+            _ => Work::Free,
+        };
+    }
+
+    /// No heartbeat came for too long: what it does where it obeys.
+    pub(super) fn lose_as_drive(&mut self) {
+        if self.state() != State::Obeys {
+            return;
+        }
+        match self.object(cia402::ABORT_CONNECTION) {
+            Some(1) => self.go_to(cia402::State::Fault),
+            Some(2) => self.go_to(cia402::State::SwitchOnDisabled),
+            Some(3) => self.go_to(cia402::State::QuickStopActive),
+            _ => {}
+        }
+    }
+
+    pub(super) fn drive_timeout(&self) -> Option<Duration> {
+        let millis = self.object(CONSUMER_HEARTBEAT)? & 0xFFFF;
+        (millis > 0).then(|| Duration::from_millis(millis.into()))
+    }
+
+    pub(super) fn drive_heartbeat(&self, node: Node) -> Frame {
+        canopen::encode_heartbeat(node, self.node_state)
+    }
+
+    /// What waited takes effect; PDOs go out as they were mapped, where they were switched on for every SYNC.
+    fn synchronous(&mut self, node: Node, units: Units) -> Result<Vec<Frame>, CanError> {
+        if let Some((controlword, target)) = self.waiting.take() {
+            let position_rad = units.rad_from_raw(target);
+            self.order(controlword, Some(Command { position_rad, ..Command::default() }));
+        }
+        let mut sent = Vec::new();
+        for pdo in [Pdo::First, Pdo::Second] {
+            if self.is_on(pdo, Direction::Transmit, node) {
+                sent.push(self.transmit(pdo, node, units)?);
+            }
+        }
+        Ok(sent)
+    }
+
+    fn transmit(&self, pdo: Pdo, node: Node, units: Units) -> Result<Frame, CanError> {
+        let n = self.object(pdo.mapping(Direction::Transmit, 0)).unwrap_or(0);
+        let mut bytes = Vec::new();
+        for place in 1..=u8::try_from(n).unwrap_or(8) {
+            let mapped = self.object(pdo.mapping(Direction::Transmit, place)).unwrap_or(0);
+            let mapped = Object::from_mapped(mapped)?;
+            let motion = self.shaft.motion;
+            let value = match mapped {
+                cia402::POSITION => units.raw_from_rad("the position", motion.position_rad)?,
+                cia402::VELOCITY => units.raw_from_rad("the velocity", motion.velocity_rad_s)?,
+                cia402::STATUSWORD => self.drive_state.statusword().into(),
+                _ => 0,
+            };
+            bytes.extend_from_slice(&value.to_le_bytes()[..usize::from(mapped.n_bytes)]);
+        }
+        Frame::classic(pdo.id(Direction::Transmit, node), &bytes)
+    }
+}

@@ -1,0 +1,262 @@
+//! Motors as their bus sees them, for tests and simulators: they answer, report, obey, and stop by themselves when nothing comes, as
+//! the makers' documents say.
+//!
+//! Written against the same documents as the codecs, so it shows that the driver works, not that the documents were understood;
+//! only real motors do that.
+
+mod damiao;
+mod drive;
+mod odrive;
+mod robstride;
+mod shaft;
+mod tmotor;
+
+pub use odrive::endpoints;
+
+use super::config::Family;
+use crate::wire::can::canopen::NodeState;
+use crate::wire::can::mit::{Command, Limits, Motion};
+use crate::wire::can::{CanError, Frame, cia402};
+use kinematics::Stamp;
+use shaft::{Shaft, Work};
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+/// How often `ODrive` axes and Robstride motors report by themselves.
+const REPORT: Duration = Duration::from_millis(10);
+/// How often drives and `ODrive` axes say that they live.
+const HEARTBEAT: Duration = Duration::from_millis(100);
+/// Of windings and drives, degrees Celsius.
+const CELSIUS: u8 = 30;
+
+/// What a motor does with its shaft.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum State {
+    /// Nothing: it turns as it is pushed.
+    Free,
+    /// What it was commanded last.
+    Obeys,
+    /// It stopped by itself, or by a quick stop, and keeps its place.
+    Held,
+}
+
+/// A motor.
+#[derive(Debug)]
+pub struct Played {
+    family: Family,
+    limits: Limits,
+    shaft: Shaft,
+    work: Work,
+    now: Option<Stamp>,
+    /// Time up to which its shaft has turned by itself.
+    turned_until: Option<Stamp>,
+    /// Registers, parameters, endpoints or objects that were set, by number.
+    settings: BTreeMap<u32, u32>,
+    ignores_timeout: bool,
+    /// When its watchdog was quieted last, and when it acted.
+    fed_at: Option<Stamp>,
+    lost_at: Option<Stamp>,
+    /// What is wrong, as the family counts it.
+    faults: u32,
+    target: Option<Command>,
+    /// Whether it reports by itself.
+    reports: bool,
+    last_report: Option<Stamp>,
+    last_heartbeat: Option<Stamp>,
+    node_state: NodeState,
+    drive_state: cia402::State,
+    /// Of a drive: the controlword and the target that take effect at the next SYNC.
+    waiting: Option<(u16, i32)>,
+    last_controlword: u16,
+}
+
+impl Played {
+    /// A motor at rest at 0, switched off. `limits`: what a Damiao motor's registers tell; the others' follow from their models.
+    pub fn new(family: Family, limits: Limits) -> Self {
+        let limits = match family {
+            Family::Robstride { model, .. } => model.limits(),
+            Family::TMotor { model, .. } => model.limits(),
+            _ => limits,
+        };
+        Self {
+            family,
+            limits,
+            shaft: Shaft::at_rest(),
+            work: Work::Free,
+            now: None,
+            turned_until: None,
+            settings: BTreeMap::new(),
+            ignores_timeout: false,
+            fed_at: None,
+            lost_at: None,
+            faults: 0,
+            target: None,
+            reports: matches!(family, Family::Odrive { .. }),
+            last_report: None,
+            last_heartbeat: None,
+            node_state: NodeState::PreOperational,
+            drive_state: cia402::State::SwitchOnDisabled,
+            waiting: None,
+            last_controlword: 0,
+        }
+    }
+
+    /// What its shaft does; from there on it goes as its drive has it, unless it is set again.
+    pub fn set_motion(&mut self, motion: Motion) {
+        self.shaft.motion = motion;
+        self.turned_until = None;
+    }
+
+    /// What its shaft does.
+    pub fn motion(&self) -> Motion {
+        self.shaft.motion
+    }
+
+    /// What it does with its shaft.
+    pub fn state(&self) -> State {
+        match self.work {
+            Work::Free => State::Free,
+            Work::Mit(_) | Work::Follow(_) => State::Obeys,
+            Work::Stop => State::Held,
+        }
+    }
+
+    /// The newest command that it obeyed; those of drives with their own position loop have no gains.
+    pub fn target(&self) -> Option<Command> {
+        self.target
+    }
+
+    /// When something quieted its watchdog last.
+    pub fn fed_at(&self) -> Option<Stamp> {
+        self.fed_at
+    }
+
+    /// When its watchdog stopped it last.
+    pub fn lost_at(&self) -> Option<Stamp> {
+        self.lost_at
+    }
+
+    /// From now on it takes no timeout, without saying so: older firmware does that.
+    pub fn ignore_timeout(&mut self) {
+        self.ignores_timeout = true;
+    }
+
+    /// Something breaks: it lets go, and tells a fault.
+    pub fn fail(&mut self) {
+        self.work = Work::Free;
+        match self.family {
+            Family::Damiao { .. } => self.faults = damiao::OVERLOAD,
+            Family::Robstride { .. } => self.faults = robstride::OVERLOAD,
+            Family::TMotor { .. } => self.faults = tmotor::OVER_CURRENT,
+            Family::Odrive { .. } => self.faults = odrive::CURRENT_LIMIT,
+            Family::Cia402 { .. } => self.drive_state = cia402::State::Fault,
+        }
+    }
+
+    /// What it sends because of a frame; nothing where that is not for it. What its protocol cannot say is an error. A frame comes at the
+    /// time of the last [`Played::report`].
+    pub fn take(&mut self, frame: &Frame) -> Result<Vec<Frame>, CanError> {
+        match self.family {
+            Family::Damiao { motor, feedback } => self.take_as_damiao(frame, motor, feedback),
+            Family::Robstride { motor, .. } => self.take_as_robstride(frame, motor),
+            Family::TMotor { motor, .. } => self.take_as_tmotor(frame, motor),
+            Family::Odrive { node } => self.take_as_odrive(frame, node),
+            Family::Cia402 { node, units } => self.take_as_drive(frame, node, units),
+        }
+    }
+
+    /// Lets time pass until now: its shaft turns, its watchdog looks; and gives what it sends unasked.
+    pub fn report(&mut self, now: Stamp) -> Result<Vec<Frame>, CanError> {
+        self.now = Some(now);
+        if let Some(before) = self.turned_until.replace(now) {
+            self.shaft.advance(now.secs_since(before), &self.work, &self.limits);
+        }
+        let is_lost = |fed: Stamp| self.timeout().is_some_and(|timeout| now.duration_since(fed) > timeout);
+        if self.fed_at.is_some_and(is_lost) {
+            self.lose(now);
+        }
+        let mut sent = Vec::new();
+        if self.reports && is_due(&mut self.last_report, now, REPORT) {
+            sent.extend(match self.family {
+                Family::Robstride { motor, .. } => Some(self.robstride_feedback(motor, true)?),
+                Family::Odrive { node } => Some(self.odrive_motion(node)?),
+                _ => None,
+            });
+        }
+        let has_heartbeat = matches!(self.family, Family::Odrive { .. } | Family::Cia402 { .. });
+        if has_heartbeat && is_due(&mut self.last_heartbeat, now, HEARTBEAT) {
+            sent.push(match self.family {
+                Family::Odrive { node } => self.odrive_heartbeat(node)?,
+                Family::Cia402 { node, .. } => self.drive_heartbeat(node),
+                _ => return Ok(sent),
+            });
+        }
+        Ok(sent)
+    }
+
+    /// How long it waits before it stops by itself; `None` is for ever.
+    fn timeout(&self) -> Option<Duration> {
+        match self.family {
+            Family::Damiao { .. } => self.damiao_timeout(),
+            Family::Robstride { .. } => self.robstride_timeout(),
+            Family::TMotor { .. } => None,
+            Family::Odrive { .. } => self.odrive_timeout(),
+            Family::Cia402 { .. } => self.drive_timeout(),
+        }
+    }
+
+    /// Nothing came for too long.
+    fn lose(&mut self, now: Stamp) {
+        self.fed_at = None;
+        if self.state() == State::Obeys {
+            self.lost_at = Some(now);
+        }
+        match self.family {
+            Family::Damiao { .. } if self.state() == State::Obeys => self.faults = damiao::LOST,
+            Family::Odrive { .. } => self.faults |= crate::wire::can::odrive::WATCHDOG_TIMER_EXPIRED,
+            Family::Cia402 { .. } => return self.lose_as_drive(),
+            _ => {}
+        }
+        self.work = Work::Free;
+    }
+
+    /// Its watchdog is quiet from now on.
+    fn feed(&mut self) {
+        self.fed_at = self.now;
+    }
+
+    /// Obeys a command of MIT mode, where it obeys.
+    fn obey(&mut self, command: Command) {
+        if self.state() == State::Obeys {
+            self.work = Work::Mit(command);
+            self.target = Some(command);
+            self.feed();
+        }
+    }
+
+    /// Sets a setting, unless it is a timeout and those are ignored.
+    fn set(&mut self, number: u32, value: u32, is_timeout: bool) {
+        if !(is_timeout && self.ignores_timeout) {
+            self.settings.insert(number, value);
+        }
+    }
+
+    fn setting(&self, number: u32) -> Option<u32> {
+        self.settings.get(&number).copied()
+    }
+
+    /// Takes hold of the shaft where it is.
+    fn switch_on(&mut self) {
+        self.work = Work::Mit(Command { position_rad: self.shaft.motion.position_rad, ..Command::default() });
+        self.feed();
+    }
+}
+
+/// Whether so long has passed since the last time, which is then now.
+fn is_due(last: &mut Option<Stamp>, now: Stamp, every: Duration) -> bool {
+    let due = last.is_none_or(|last| now.duration_since(last) >= every);
+    if due {
+        *last = Some(now);
+    }
+    due
+}

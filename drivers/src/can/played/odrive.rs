@@ -1,0 +1,96 @@
+//! An `ODrive` axis. It follows positions with a loop of its own, and its watchdog looks also while it is idle.
+
+use super::shaft::Work;
+use super::{Played, State};
+use crate::wire::can::mit::{Command, Motion};
+use crate::wire::can::odrive::{self, Answer, Code, Endpoints, Node};
+use crate::wire::can::{CanError, Frame};
+use std::f64::consts::TAU;
+use std::time::Duration;
+
+/// A bit of its errors.
+pub(super) const CURRENT_LIMIT: u32 = 1 << 12;
+const HARDWARE: [u8; 3] = [4, 4, 58];
+const FIRMWARE: [u8; 3] = [0, 6, 9];
+const WATCHDOG_TIMEOUT: u16 = 218;
+const ENABLE_WATCHDOG: u16 = 219;
+
+/// Numbers of the endpoints of played axes.
+pub fn endpoints() -> Endpoints {
+    let dotted = |version: [u8; 3]| version.map(|part| part.to_string()).join(".");
+    Endpoints {
+        firmware: dotted(FIRMWARE),
+        hardware: dotted(HARDWARE),
+        watchdog_timeout: WATCHDOG_TIMEOUT,
+        enable_watchdog: ENABLE_WATCHDOG,
+    }
+}
+
+impl Played {
+    pub(super) fn take_as_odrive(&mut self, frame: &Frame, node: Node) -> Result<Vec<Frame>, CanError> {
+        let id = frame.id();
+        if id.is_extended() || id.value() >> 5 != u32::from(node.number()) {
+            return Ok(Vec::new());
+        }
+        let is = |code: Code| id.value() & 0x1F == code as u32;
+        if frame.is_remote() {
+            let version = Answer::Version { hardware: HARDWARE, firmware: FIRMWARE };
+            return if is(Code::Version) { Ok(vec![odrive::encode_answer(node, &version)?]) } else { Ok(Vec::new()) };
+        }
+        if is(Code::SetState) {
+            match frame.data() {
+                [1, 0, 0, 0] => self.work = Work::Free,
+                [8, 0, 0, 0] if self.faults == 0 => {
+                    // It begins with where it is, whatever was asked for before.
+                    let position_rad = self.shaft.motion.position_rad;
+                    self.work = Work::Follow(Command { position_rad, ..Command::default() });
+                }
+                _ => {}
+            }
+        } else if is(Code::ClearErrors) {
+            self.faults = 0;
+        } else if is(Code::SetPosition) {
+            let &[a, b, c, d, e, f, ..] = frame.data() else { return Ok(Vec::new()) };
+            let command = Command {
+                position_rad: f64::from(f32::from_le_bytes([a, b, c, d])) * TAU,
+                velocity_rad_s: f64::from(i16::from_le_bytes([e, f])) * 1e-3 * TAU,
+                ..Command::default()
+            };
+            if self.state() == State::Obeys {
+                self.work = Work::Follow(command);
+                self.target = Some(command);
+            }
+        } else if is(Code::EndpointRequest) {
+            let &[operation, low, high, _, a, b, c, d] = frame.data() else { return Ok(Vec::new()) };
+            let number = u16::from_le_bytes([low, high]);
+            if operation == 1 {
+                self.set(number.into(), u32::from_le_bytes([a, b, c, d]), number == WATCHDOG_TIMEOUT);
+            } else {
+                let value = self.setting(number.into()).unwrap_or(0).to_le_bytes();
+                return Ok(vec![odrive::encode_answer(node, &Answer::Endpoint(number, value))?]);
+            }
+        }
+        // Whatever comes to it quiets its watchdog.
+        self.feed();
+        Ok(Vec::new())
+    }
+
+    pub(super) fn odrive_timeout(&self) -> Option<Duration> {
+        let is_on = self.setting(ENABLE_WATCHDOG.into()).is_some_and(|bytes| bytes & 1 == 1);
+        let secs = f32::from_bits(self.setting(WATCHDOG_TIMEOUT.into()).unwrap_or(0));
+        if is_on { Duration::try_from_secs_f32(secs).ok() } else { None }
+    }
+
+    pub(super) fn odrive_motion(&self, node: Node) -> Result<Frame, CanError> {
+        let Motion { position_rad, velocity_rad_s, .. } = self.shaft.motion;
+        odrive::encode_answer(node, &Answer::Motion { position_rad, velocity_rad_s })
+    }
+
+    pub(super) fn odrive_heartbeat(&self, node: Node) -> Result<Frame, CanError> {
+        let state = match self.state() {
+            State::Obeys => odrive::State::ClosedLoopControl,
+            State::Free | State::Held => odrive::State::Idle,
+        };
+        odrive::encode_answer(node, &Answer::Heartbeat { errors: self.faults, state })
+    }
+}

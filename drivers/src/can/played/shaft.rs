@@ -1,0 +1,112 @@
+//! The shaft of a played motor: inertia, friction, and what its drive does with it.
+
+use crate::wire::can::mit::{Command, Limits, Motion};
+
+/// Of the shaft and what hangs on it, kg m2.
+const INERTIA_KG_M2: f64 = 0.05;
+/// Viscous, N m s / rad.
+const FRICTION_NM_S_RAD: f64 = 0.25;
+/// How fast a drive with its own position loop closes in on its target, 1 / s, and how fast it turns at most, rad / s.
+const FOLLOWING_HZ: f64 = 60.0;
+const MAX_FOLLOWING_RAD_S: f64 = 40.0;
+/// On the quick-stop ramp, rad / s2.
+const QUICK_STOP_RAD_S2: f64 = 30.0;
+/// The physics goes in steps of this length at most, s.
+const STEP_SECS: f64 = 2.5e-4;
+/// A bench that stood still for longer goes on from there, s.
+const MAX_SECS: f64 = 1.0;
+
+/// What a drive does with its shaft.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Work {
+    /// Nothing.
+    Free,
+    /// The law of MIT mode.
+    Mit(Command),
+    /// Its own position loop.
+    Follow(Command),
+    /// It stops, and keeps its place.
+    Stop,
+}
+
+/// Turns with what works on it.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Shaft {
+    pub(super) motion: Motion,
+}
+
+impl Shaft {
+    pub(super) fn at_rest() -> Self {
+        Self { motion: Motion { position_rad: 0.0, velocity_rad_s: 0.0, torque_nm: 0.0 } }
+    }
+
+    /// Lets time pass.
+    pub(super) fn advance(&mut self, secs: f64, work: &Work, limits: &Limits) {
+        let mut left = secs.clamp(0.0, MAX_SECS);
+        while left > 0.0 {
+            let step = left.min(STEP_SECS);
+            self.step(step, work, limits);
+            left -= step;
+        }
+    }
+
+    fn step(&mut self, secs: f64, work: &Work, limits: &Limits) {
+        let Motion { position_rad, velocity_rad_s, .. } = self.motion;
+        let torque_nm = match work {
+            Work::Free => 0.0,
+            Work::Mit(command) => {
+                let torque = command.kp_nm_rad * (command.position_rad - position_rad)
+                    + command.kd_nm_s_rad * (command.velocity_rad_s - velocity_rad_s)
+                    + command.torque_nm;
+                torque.clamp(-limits.torque_nm, limits.torque_nm)
+            }
+            Work::Follow(command) => {
+                let wanted = command.velocity_rad_s + FOLLOWING_HZ * (command.position_rad - position_rad);
+                return self.turn(wanted.clamp(-MAX_FOLLOWING_RAD_S, MAX_FOLLOWING_RAD_S), secs);
+            }
+            Work::Stop => {
+                let slower = QUICK_STOP_RAD_S2 * secs;
+                return self.turn(velocity_rad_s - velocity_rad_s.clamp(-slower, slower), secs);
+            }
+        };
+        let acceleration = (torque_nm - FRICTION_NM_S_RAD * velocity_rad_s) / INERTIA_KG_M2;
+        self.turn(velocity_rad_s + acceleration * secs, secs);
+        self.motion.torque_nm = torque_nm;
+    }
+
+    fn turn(&mut self, velocity_rad_s: f64, secs: f64) {
+        let position_rad = self.motion.position_rad + velocity_rad_s * secs;
+        self.motion = Motion { position_rad, velocity_rad_s, torque_nm: 0.0 };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
+
+    #[test]
+    fn it_goes_where_its_drive_has_it_and_rests_there() {
+        let command = Command { position_rad: 0.7, kp_nm_rad: 30.0, kd_nm_s_rad: 1.5, ..Command::default() };
+        for work in [Work::Mit(command), Work::Follow(command)] {
+            let mut shaft = Shaft::at_rest();
+            for _ in 0..1500 {
+                shaft.advance(2e-3, &work, &LIMITS);
+            }
+            assert!((shaft.motion.position_rad - 0.7).abs() < 1e-6, "{work:?} {:?}", shaft.motion);
+        }
+    }
+
+    #[test]
+    fn a_free_shaft_coasts_and_one_that_stops_rests_soon() {
+        let moving = Shaft { motion: Motion { position_rad: 0.0, velocity_rad_s: 3.0, torque_nm: 0.0 } };
+        let (mut free, mut stopped) = (moving, moving);
+        free.advance(0.2, &Work::Free, &LIMITS);
+        stopped.advance(0.2, &Work::Stop, &LIMITS);
+        assert!(free.motion.position_rad > 0.3 && free.motion.velocity_rad_s > 1.0, "{:?}", free.motion);
+        // Half of 3 rad/s for a tenth of a second.
+        assert!((stopped.motion.position_rad - 0.15).abs() < 1e-3, "{:?}", stopped.motion);
+        assert_eq!(stopped.motion.velocity_rad_s, 0.0);
+    }
+}

@@ -1,0 +1,199 @@
+//! Questions to one motor and its answers, while nothing else reads the bus: what is done before a cycle begins.
+
+use super::ROBSTRIDE_HOST;
+use super::bus::{Arrived, Bus, WireErrors};
+use super::config::MotorConfig;
+use crate::wire::can::canopen::{self, Object, SdoAnswer};
+use crate::wire::can::damiao::{self, Access, Register, RegisterMessage};
+use crate::wire::can::mit::Limits;
+use crate::wire::can::robstride::{self, Parameter, Request};
+use crate::wire::can::{CanError, Frame, Id, odrive};
+use crate::{Error, clock};
+use std::cell::Cell;
+use std::time::Duration;
+
+/// How long an answer may take; on a full bus at 1 Mbit/s a frame waits for some milliseconds.
+const MAX_ANSWER: Duration = Duration::from_millis(50);
+/// How often a question is asked before the motor counts as silent.
+const MAX_ASKED: usize = 4;
+
+/// A conversation with one motor.
+pub(super) struct Talk<'a> {
+    bus: &'a Bus,
+    config: &'a MotorConfig,
+    errors: Cell<WireErrors>,
+}
+
+impl<'a> Talk<'a> {
+    pub(super) fn new(bus: &'a Bus, config: &'a MotorConfig) -> Self {
+        Self { bus, config, errors: Cell::default() }
+    }
+
+    pub(super) fn name(&self) -> String {
+        format!("joint {:?} on {:?}", self.config.joint, self.bus.config().interface)
+    }
+
+    pub(super) fn fault(&self, reason: impl Into<String>) -> Error {
+        let interface = self.bus.config().interface.clone();
+        Error::Motor { joint: self.config.joint.clone(), interface, reason: reason.into() }
+    }
+
+    /// What a codec said, as an error of this motor.
+    pub(super) fn said<T>(&self, result: Result<T, CanError>) -> Result<T, Error> {
+        result.map_err(|error| self.fault(error.to_string()))
+    }
+
+    /// Sends what a codec made.
+    pub(super) fn send(&self, frame: Result<Frame, CanError>) -> Result<(), Error> {
+        let frame = self.said(frame)?;
+        match self.bus.send(&frame)? {
+            true => Ok(()),
+            false => Err(self.fault("nothing can be sent: the interface's queue stays full")),
+        }
+    }
+
+    /// The first frame within a time that `answers`.
+    pub(super) fn wait<T>(
+        &self,
+        within: Duration,
+        mut answers: impl FnMut(&Frame) -> Option<T>,
+    ) -> Result<Option<T>, Error> {
+        let until = clock::now() + within;
+        loop {
+            let left = until.duration_since(clock::now());
+            if left.is_zero() {
+                return Ok(None);
+            }
+            match self.bus.receive(left)? {
+                Some((_, Arrived::Frame(frame))) => {
+                    if let Some(answer) = answers(&frame) {
+                        return Ok(Some(answer));
+                    }
+                }
+                Some((_, Arrived::Errors(more))) => {
+                    let mut errors = self.errors.get();
+                    errors.add(&more);
+                    self.errors.set(errors);
+                }
+                None => {}
+            }
+        }
+    }
+
+    /// Asks until an answer comes, some times.
+    pub(super) fn ask<T>(&self, question: &Frame, mut answers: impl FnMut(&Frame) -> Option<T>) -> Result<T, Error> {
+        for _ in 0..MAX_ASKED {
+            self.bus.send(question)?;
+            if let Some(answer) = self.wait(MAX_ANSWER, &mut answers)? {
+                return Ok(answer);
+            }
+        }
+        let errors = self.errors.get();
+        Err(self.fault(match errors.n_unacknowledged + errors.n_bus_off {
+            0 => format!("no answer to {MAX_ASKED} questions; is the motor powered and its number right?"),
+            _ => "nobody acknowledges frames: the others are off, at another bit rate, or the bus is cut or not terminated"
+                .to_owned(),
+        }))
+    }
+
+    /// What a register of a Damiao motor holds.
+    pub(super) fn register(&self, motor: u16, feedback: u16, register: Register) -> Result<damiao::Value, Error> {
+        let question = RegisterMessage { motor, access: Access::Read(register) };
+        let question = self.said(damiao::encode_register(&question, None))?;
+        let answer_id = self.said(Id::standard(feedback.into()))?;
+        self.ask(&question, |frame| match damiao::decode_register(frame) {
+            Ok(RegisterMessage { motor: from, access: Access::Told(told, value) })
+                if frame.id() == answer_id && from == motor && told == register =>
+            {
+                Some(value)
+            }
+            _ => None,
+        })
+    }
+
+    /// Sends a request to a Robstride motor.
+    pub(super) fn robstride(&self, motor: u8, request: &Request, limits: &Limits) -> Result<(), Error> {
+        self.send(robstride::encode_request(ROBSTRIDE_HOST, motor, request, limits))
+    }
+
+    /// What a parameter of a Robstride motor holds.
+    pub(super) fn parameter(
+        &self,
+        motor: u8,
+        parameter: Parameter,
+        limits: &Limits,
+    ) -> Result<robstride::Value, Error> {
+        let question = robstride::encode_request(ROBSTRIDE_HOST, motor, &Request::Read(parameter), limits);
+        self.ask(&self.said(question)?, |frame| match robstride::decode_answer(frame, ROBSTRIDE_HOST, limits) {
+            Ok(robstride::Answer::Parameter { motor: from, parameter: told, value }) => {
+                (from == motor && told == parameter).then_some(value)
+            }
+            _ => None,
+        })
+    }
+
+    /// What an `ODrive` axis answers to a question.
+    pub(super) fn axis<T>(
+        &self,
+        node: odrive::Node,
+        request: &odrive::Request,
+        answers: impl Fn(odrive::Answer) -> Option<T>,
+    ) -> Result<T, Error> {
+        let question = self.said(odrive::encode_request(node, request))?;
+        self.ask(&question, |frame| match odrive::decode_answer(frame) {
+            Ok((from, answer)) if from == node => answers(answer),
+            _ => None,
+        })
+    }
+
+    /// What an object of a CANopen node holds; its upper bytes are 0 where it is shorter.
+    pub(super) fn get(&self, node: canopen::Node, object: Object) -> Result<u32, Error> {
+        let answer = self.ask(&canopen::encode_read(node, object), |frame| match canopen::decode_sdo(frame) {
+            Ok((from, SdoAnswer::Value { object: told, raw })) => {
+                (from == node && (told.index, told.subindex) == (object.index, object.subindex)).then_some(Ok(raw))
+            }
+            Err(error @ (CanError::Aborted { index, .. } | CanError::Segmented { index, .. })) => {
+                (index == object.index).then_some(Err(error))
+            }
+            _ => None,
+        })?;
+        self.said(answer)
+    }
+
+    /// Sets an object of a CANopen node and reads it back.
+    pub(super) fn set_and_check(&self, node: canopen::Node, object: Object, value: i64) -> Result<(), Error> {
+        self.set(node, object, value)?;
+        let bits = u32::MAX >> (32 - 8 * u32::from(object.n_bytes));
+        let told = self.get(node, object)? & bits;
+        match i64::from(told) == value & i64::from(bits) {
+            true => Ok(()),
+            false => Err(self.fault(format!(
+                "object {:#06x}:{:02x} was set to {value} and reads back as {told:#x}",
+                object.index, object.subindex
+            ))),
+        }
+    }
+
+    /// Sets an object of a CANopen node.
+    pub(super) fn set(&self, node: canopen::Node, object: Object, value: i64) -> Result<(), Error> {
+        let answer = self.try_set(node, object, value)?;
+        self.said(answer)
+    }
+
+    /// The same, where the node may refuse it.
+    pub(super) fn try_set(
+        &self,
+        node: canopen::Node,
+        object: Object,
+        value: i64,
+    ) -> Result<Result<(), CanError>, Error> {
+        let question = self.said(canopen::encode_write(node, object, value))?;
+        self.ask(&question, |frame| match canopen::decode_sdo(frame) {
+            Ok((from, SdoAnswer::Written { index, subindex })) => {
+                (from == node && (index, subindex) == (object.index, object.subindex)).then_some(Ok(()))
+            }
+            Err(error @ CanError::Aborted { index, .. }) => (index == object.index).then_some(Err(error)),
+            _ => None,
+        })
+    }
+}

@@ -1,0 +1,235 @@
+//! What motors do by themselves once nothing comes from us any more, how they are told to, and what they cannot do.
+//!
+//! - Damiao: register `TIMEOUT`; the motor leaves the enabled state and tells "communication lost". Source: Damiao DM-J4310-2EC manual
+//!   V1.0, as in `jia-xie/python-damiao-driver` `docs/concept/`.
+//! - Robstride: parameter `canTimeout`; the motor goes to its reset mode. The damping of its parameter `damper` is against surges of
+//!   motors without power, and cannot be relied on. Source: RS00 to RS06 user manuals, sections 4.2 and 4.3.5.
+//! - ODrive: `axis0.config.watchdog_timeout` and `enable_watchdog`; the axis is disarmed. Source: ODrive documentation, error
+//!   `WATCHDOG_TIMER_EXPIRED`.
+//! - CiA 402: consumer heartbeat (`0x1016`) with abort connection option code (`0x6007`): a quick stop that stays stopped (`0x605A` = 6),
+//!   or voltage off. Source: CiA 301, section 7.5.2.20; CiA 402-2, objects 6007h and 605Ah. What the drive does on faults of its own
+//!   (`0x605E`) is left as it was set.
+//! - T-Motor AK: nothing; the last command is obeyed for ever. Source: CubeMars AK Series Module Product Manual, MIT mode.
+
+use super::config::{Family, MotorConfig};
+use super::talk::Talk;
+use crate::Error;
+use crate::motion::OnLoss;
+use crate::wire::can::canopen::{self, CONSUMER_HEARTBEAT};
+use crate::wire::can::cia402;
+use crate::wire::can::damiao::{self, Access, Register, RegisterMessage};
+use crate::wire::can::mit::Limits;
+use crate::wire::can::odrive::{self, Endpoints};
+use crate::wire::can::robstride::{self, Parameter};
+use std::time::Duration;
+
+/// What all motors of an arm are set to.
+#[derive(Clone, Debug)]
+pub(super) struct Plan {
+    pub(super) on_loss: OnLoss,
+    pub(super) timeout: Duration,
+    pub(super) accept_no_watchdog: bool,
+    /// Numbers of `ODrive`'s endpoints, without which its watchdog cannot be set.
+    pub(super) endpoints: Option<Endpoints>,
+    /// Our own number among CANopen nodes, whose heartbeat is missed.
+    pub(super) host: canopen::Node,
+    /// From cycle to cycle.
+    pub(super) period: Duration,
+}
+
+impl Plan {
+    /// Whether a motor notices by itself that nothing comes any more.
+    pub(super) fn has_watchdog(&self, family: &Family) -> bool {
+        match family {
+            Family::TMotor { .. } => false,
+            Family::Odrive { .. } => self.endpoints.is_some(),
+            Family::Damiao { .. } | Family::Robstride { .. } | Family::Cia402 { .. } => true,
+        }
+    }
+
+    /// Whether a motor may be moved as planned; said before anything is sent to it.
+    pub(super) fn check(&self, config: &MotorConfig, interface: &str) -> Result<(), Error> {
+        let fault = |reason| Err(Error::Motor { joint: config.joint.clone(), interface: interface.to_owned(), reason });
+        let has_watchdog = self.has_watchdog(&config.family);
+        if !has_watchdog && !self.accept_no_watchdog {
+            let what = match config.family {
+                Family::Odrive { .. } => "without arm.motion.odrive_endpoints its watchdog cannot be set, and it",
+                _ => "a motor of this family has no watchdog: it",
+            };
+            return fault(format!(
+                "{what} would go on with its last command for ever if this computer fell silent; it is moved only with \
+                 arm.motion.accept_no_watchdog = true"
+            ));
+        }
+        let can = can_do(&config.family, has_watchdog);
+        if !can.contains(&self.on_loss) {
+            let can: Vec<_> = can.iter().map(|can| format!("{:?}", can.word())).collect();
+            let wanted = self.on_loss.word();
+            return fault(format!("arm.motion.on_loss is {wanted:?}, and this motor can only {}", can.join(" or ")));
+        }
+        if config.gains.is_none() && has_gains(&config.family) {
+            return fault("moving it needs its stiffness_nm_rad and damping_nm_s_rad".to_owned());
+        }
+        Ok(())
+    }
+}
+
+/// Whether each command carries how stiffly the joint is held.
+fn has_gains(family: &Family) -> bool {
+    matches!(family, Family::Damiao { .. } | Family::Robstride { .. } | Family::TMotor { .. })
+}
+
+/// What motors do by their own watchdogs; or, without one, what they can be told while there still is somebody to tell it.
+fn can_do(family: &Family, has_watchdog: bool) -> &'static [OnLoss] {
+    match (family, has_watchdog) {
+        (Family::Cia402 { .. }, _) | (Family::Odrive { .. }, false) => &[OnLoss::Hold, OnLoss::Release],
+        (Family::TMotor { .. }, _) => &[OnLoss::Hold, OnLoss::Damp, OnLoss::Release],
+        (Family::Damiao { .. } | Family::Robstride { .. } | Family::Odrive { .. }, _) => &[OnLoss::Release],
+    }
+}
+
+/// Sets the watchdog of a motor that is switched off, and reads it back; one that reads back otherwise is an error.
+pub(super) fn set(talk: &Talk<'_>, family: &Family, limits: &Limits, plan: &Plan) -> Result<(), Error> {
+    let seconds = plan.timeout.as_secs_f64();
+    let differs = |told: String| {
+        Err(talk.fault(format!("its timeout was set to {seconds} s and reads back as {told}; it is not switched on")))
+    };
+    match *family {
+        Family::Damiao { motor, feedback } => {
+            let wanted = damiao::Value::Whole(talk.said(damiao::timeout_ticks(seconds))?);
+            let message = RegisterMessage { motor, access: Access::Write(Register::Timeout, wanted) };
+            talk.send(damiao::encode_register(&message, None))?;
+            match talk.register(motor, feedback, Register::Timeout)? {
+                told if told == wanted => Ok(()),
+                told => differs(format!("{told:?} ticks")),
+            }
+        }
+        Family::Robstride { motor, .. } => {
+            let wanted = talk.said(robstride::timeout(seconds))?;
+            talk.robstride(motor, &robstride::Request::Write(Parameter::Timeout, wanted), limits)?;
+            match talk.parameter(motor, Parameter::Timeout, limits)? {
+                told if told == wanted => Ok(()),
+                told => differs(format!("{told:?} ticks")),
+            }
+        }
+        Family::Odrive { node } => match &plan.endpoints {
+            Some(endpoints) => set_axis(talk, node, endpoints, plan.timeout, differs),
+            None => Ok(()),
+        },
+        Family::Cia402 { node, .. } => {
+            let millis = u16::try_from(plan.timeout.as_millis()).unwrap_or(u16::MAX);
+            let heartbeat = canopen::consumer_heartbeat(plan.host, millis);
+            talk.set_and_check(node, CONSUMER_HEARTBEAT, heartbeat.into())?;
+            let reaction = match plan.on_loss {
+                OnLoss::Hold => {
+                    talk.set_and_check(node, cia402::QUICK_STOP_OPTION, cia402::STAY_STOPPED)?;
+                    cia402::ABORT_BY_QUICK_STOP
+                }
+                OnLoss::Damp | OnLoss::Release => cia402::ABORT_BY_DISABLING,
+            };
+            talk.set_and_check(node, cia402::ABORT_CONNECTION, reaction)
+        }
+        Family::TMotor { .. } => Ok(()),
+    }
+}
+
+/// The watchdog of an `ODrive` axis, after its firmware was found to be that of the endpoints: other numbers set other things.
+fn set_axis(
+    talk: &Talk<'_>,
+    node: odrive::Node,
+    endpoints: &Endpoints,
+    timeout: Duration,
+    differs: impl Fn(String) -> Result<(), Error>,
+) -> Result<(), Error> {
+    let version = odrive::Request::Ask(odrive::Code::Version);
+    let (hardware, firmware) = talk.axis(node, &version, |answer| match answer {
+        odrive::Answer::Version { hardware, firmware } => Some((hardware, firmware)),
+        _ => None,
+    })?;
+    if !endpoints.are_of(hardware, firmware) {
+        return Err(talk.fault(format!(
+            "it runs firmware {firmware:?} on hardware {hardware:?}, and arm.motion.odrive_endpoints is of firmware {} on hardware {}",
+            endpoints.firmware, endpoints.hardware
+        )));
+    }
+    // A flag is one byte; what is behind it in an answer means nothing.
+    let settings = [
+        (endpoints.watchdog_timeout, timeout.as_secs_f32().to_le_bytes(), 4),
+        (endpoints.enable_watchdog, [1, 0, 0, 0], 1),
+    ];
+    for (number, bytes, n_bytes) in settings {
+        talk.send(odrive::encode_request(node, &odrive::Request::WriteEndpoint(number, bytes)))?;
+        let told = talk.axis(node, &odrive::Request::ReadEndpoint(number), |answer| match answer {
+            odrive::Answer::Endpoint(told, bytes) => (told == number).then_some(bytes),
+            _ => None,
+        })?;
+        if told[..n_bytes] != bytes[..n_bytes] {
+            return differs(format!("{told:?} in endpoint {number}"));
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::config::Gains;
+    use super::*;
+    use crate::wire::can::{odrive, tmotor};
+
+    fn told(family: Family, on_loss: OnLoss, accept_no_watchdog: bool, endpoints: Option<Endpoints>) -> Option<String> {
+        let gains = Some(Gains { stiffness_nm_rad: 1.0, damping_nm_s_rad: 1.0 });
+        let config = MotorConfig {
+            joint: "elbow".to_owned(),
+            bus_ix: 0,
+            family,
+            gear_ratio: 1.0,
+            is_reversed: false,
+            offset_rad: 0.0,
+            gains,
+        };
+        let plan = Plan {
+            on_loss,
+            timeout: Duration::from_millis(100),
+            accept_no_watchdog,
+            endpoints,
+            host: canopen::Node::new(127).expect("a node"),
+            period: Duration::from_millis(5),
+        };
+        plan.check(&config, "can0").err().map(|error| error.to_string())
+    }
+
+    #[test]
+    fn what_each_family_cannot_do_is_told_with_what_it_can() {
+        let units = cia402::Units { counts_per_turn: 1.0, rated_torque_nm: 1.0 };
+        let drive = Family::Cia402 { node: canopen::Node::new(1).expect("a node"), units };
+        let damiao = Family::Damiao { motor: 1, feedback: 2 };
+        let robstride = Family::Robstride { motor: 1, model: robstride::Model::Rs00 };
+        let odrive = Family::Odrive { node: odrive::Node::new(1).expect("a node") };
+        let ak = Family::TMotor { motor: 1, model: tmotor::Model::Ak80x9 };
+        for (family, on_loss, expected) in [
+            (damiao, OnLoss::Release, None),
+            (damiao, OnLoss::Hold, Some("can only \"release\"")),
+            (robstride, OnLoss::Release, None),
+            (robstride, OnLoss::Damp, Some("can only \"release\"")),
+            (drive, OnLoss::Hold, None),
+            (drive, OnLoss::Release, None),
+            (drive, OnLoss::Damp, Some("can only \"hold\" or \"release\"")),
+            (odrive, OnLoss::Release, Some("arm.motion.odrive_endpoints")),
+            (ak, OnLoss::Release, Some("accept_no_watchdog = true")),
+        ] {
+            let told = told(family, on_loss, false, None);
+            let is_as_expected = match (&told, expected) {
+                (Some(told), Some(expected)) => told.contains(expected) && told.contains("\"elbow\" on \"can0\""),
+                (told, expected) => told.is_none() && expected.is_none(),
+            };
+            assert!(is_as_expected, "{family:?} {on_loss:?}: {told:?}");
+        }
+        for on_loss in [OnLoss::Hold, OnLoss::Damp, OnLoss::Release] {
+            assert_eq!(told(ak, on_loss, true, None), None, "it was accepted");
+        }
+        let endpoints = Some(super::super::played::endpoints());
+        assert_eq!(told(odrive, OnLoss::Release, false, endpoints.clone()), None);
+        assert!(told(odrive, OnLoss::Hold, true, endpoints).is_some(), "its watchdog only lets go");
+        assert_eq!(told(odrive, OnLoss::Hold, true, None), None);
+    }
+}

@@ -1,0 +1,100 @@
+//! Numbers of the endpoints that set an axis' watchdog: they differ by firmware, and the maker publishes a file for each.
+//!
+//! Source: ODrive CAN protocol page, "Arbitrary parameter access"; `odriverobotics/ODriveResources` `can_restore_config.py`, which
+//! compares `fw_version` and `hw_version` of `flat_endpoints.json` with the axis' own (`Get_Version`) before it writes anything.
+
+use serde::Deserialize;
+use std::collections::BTreeMap;
+
+/// What of a firmware's `flat_endpoints.json` is needed to move an axis.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Endpoints {
+    /// Version of the firmware that it is of, "0.6.10" for instance.
+    pub firmware: String,
+    /// Version of the hardware that it is of: product line, version and variant.
+    pub hardware: String,
+    /// Seconds without a command until the axis lets go, a real number.
+    pub watchdog_timeout: u16,
+    /// Whether it does so at all, one byte.
+    pub enable_watchdog: u16,
+}
+
+/// A text that is not such a file.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum EndpointsError {
+    /// It is another kind of text.
+    #[error("it is no flat_endpoints.json of ODrive: {0}")]
+    Malformed(#[from] serde_json::Error),
+    /// An endpoint is not in it, or has another type.
+    #[error("it has no endpoint {name:?} of the type {kind}")]
+    Missing {
+        /// Path of the endpoint.
+        name: &'static str,
+        /// Its type.
+        kind: &'static str,
+    },
+}
+
+#[derive(Deserialize)]
+struct Flat {
+    fw_version: String,
+    hw_version: String,
+    endpoints: BTreeMap<String, Endpoint>,
+}
+
+#[derive(Deserialize)]
+struct Endpoint {
+    id: u16,
+    #[serde(rename = "type")]
+    kind: String,
+}
+
+impl Endpoints {
+    /// Reads the text of a `flat_endpoints.json`.
+    pub fn parse(text: &str) -> Result<Self, EndpointsError> {
+        let flat: Flat = serde_json::from_str(text)?;
+        let number = |name: &'static str, kind: &'static str| {
+            let found = flat.endpoints.get(name).filter(|endpoint| endpoint.kind == kind);
+            found.map(|endpoint| endpoint.id).ok_or(EndpointsError::Missing { name, kind })
+        };
+        let watchdog_timeout = number("axis0.config.watchdog_timeout", "float")?;
+        let enable_watchdog = number("axis0.config.enable_watchdog", "bool")?;
+        Ok(Self { firmware: flat.fw_version, hardware: flat.hw_version, watchdog_timeout, enable_watchdog })
+    }
+
+    /// Whether they are of an axis that tells these versions.
+    pub fn are_of(&self, hardware: [u8; 3], firmware: [u8; 3]) -> bool {
+        let dotted = |version: [u8; 3]| version.map(|part| part.to_string()).join(".");
+        self.firmware == dotted(firmware) && self.hardware == dotted(hardware)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TEXT: &str = r#"{"fw_version": "0.6.9", "hw_version": "4.4.58", "endpoints": {
+        "vbus_voltage": {"id": 1, "type": "float", "access": "r"},
+        "axis0.watchdog_feed": {"id": 190, "type": "function", "inputs": [], "outputs": []},
+        "axis0.config.watchdog_timeout": {"id": 218, "type": "float", "access": "rw"},
+        "axis0.config.enable_watchdog": {"id": 219, "type": "bool", "access": "rw"}}}"#;
+
+    #[test]
+    fn the_watchdog_is_found_in_the_makers_file() {
+        let endpoints = Endpoints::parse(TEXT).expect("a file");
+        assert_eq!((endpoints.watchdog_timeout, endpoints.enable_watchdog), (218, 219));
+        assert!(endpoints.are_of([4, 4, 58], [0, 6, 9]));
+        assert!(!endpoints.are_of([4, 4, 58], [0, 6, 10]) && !endpoints.are_of([4, 4, 57], [0, 6, 9]));
+    }
+
+    #[test]
+    fn another_file_is_refused() {
+        assert!(matches!(Endpoints::parse("[]"), Err(EndpointsError::Malformed(_))));
+        assert!(matches!(Endpoints::parse(&TEXT[..60]), Err(EndpointsError::Malformed(_))));
+        let renamed = TEXT.replace("config.enable_watchdog", "config.watch");
+        assert!(Endpoints::parse(&renamed).expect_err("no watchdog").to_string().contains("enable_watchdog"));
+        let wide = TEXT.replace("\"bool\"", "\"uint32\"");
+        assert!(matches!(Endpoints::parse(&wide), Err(EndpointsError::Missing { kind: "bool", .. })));
+    }
+}
