@@ -4,13 +4,15 @@
 # the page's npm packages) and says so; without root it prints the one line to run.
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check deps web cargo packages hil-packages mujoco open-ends
+.PHONY: help demo test hil check deps web cargo packages hil-packages mujoco open-ends
 
 # One feature set everywhere, so that dependencies compile once.
 FEATURES := --features sim
 
 # The rig that `make demo` simulates: a file of the folder rigs.
 RIG ?= static-arm
+# How long `make hil` listens.
+LISTEN_SECONDS ?= 20
 
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -21,6 +23,10 @@ demo: deps web ## Simulate a rig (RIG=static-arm, mobile-arm, mobile-base-small,
 
 test: check web hil-packages ## Lints, documentation and every test that needs no device
 	cargo test --workspace $(FEATURES) --no-fail-fast
+
+hil: cargo packages web ## Check the rig RIG=file.toml on whatever is plugged in: everything is read for LISTEN_SECONDS=20, nothing is moved
+	cargo build --release
+	target/release/fieldrig doctor $(if $(filter file,$(origin RIG)),$(error say which rig: make hil RIG=file.toml),$(RIG)) --listen $(LISTEN_SECONDS)
 
 check: deps open-ends ## Format, clippy, documentation, kernels, licences, open ends
 	cargo fmt --all --check

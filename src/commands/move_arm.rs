@@ -173,7 +173,12 @@ impl Mover {
     /// Heads for a target; what is truly headed for comes back.
     fn command(&mut self, wanted: &JointTarget) -> Result<JointTarget, Error> {
         let shifted = |target: &JointTarget, sign: f64| JointTarget {
-            position: target.position.iter().zip(&self.offsets).map(|(position, offset)| position + sign * offset).collect(),
+            position: target
+                .position
+                .iter()
+                .zip(&self.offsets)
+                .map(|(position, offset)| position + sign * offset)
+                .collect(),
         };
         let taken = self.arm.command(&shifted(wanted, -1.0))?;
         Ok(shifted(&taken, 1.0))

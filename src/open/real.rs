@@ -47,7 +47,6 @@ pub(super) fn open(rig: &Rig) -> anyhow::Result<Devices> {
 
 /// Opens the arm to be moved: it is switched on and held where it is. Its joints are as the device tells them, without
 /// `arm.joint_offsets`.
-#[expect(dead_code, reason = "the command that moves an arm is the one that opens it so")]
 pub(crate) fn movable_arm(rig: &Rig) -> anyhow::Result<Box<dyn MovableArm>> {
     let Some(motion) = &rig.arm.motion else {
         bail!(

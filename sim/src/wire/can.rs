@@ -1,7 +1,7 @@
-//! Motors on CAN buses whose shafts follow a script: a thread a bus.
+//! Motors on CAN buses whose shafts follow a script until a client switches one on: a thread a bus.
 
 use super::JointTrack;
-use drivers::can::played::Played;
+use drivers::can::played::{Played, State};
 use drivers::can::{ArmConfig, Arrived, Bus, MotorConfig};
 use drivers::wire::can::mit::{Limits, Motion};
 use drivers::{Error, clock};
@@ -19,14 +19,23 @@ const TICK: Duration = Duration::from_millis(1);
 /// Motors that answer until they are dropped.
 #[derive(Debug)]
 pub struct PlayedMotors {
-    stop: Arc<AtomicBool>,
+    signs: Arc<Signs>,
     threads: Vec<JoinHandle<()>>,
+}
+
+/// What the threads of an arm tell each other.
+#[derive(Debug, Default)]
+struct Signs {
+    stop: AtomicBool,
+    /// A client has switched a motor on.
+    is_moved: AtomicBool,
 }
 
 impl PlayedMotors {
     /// Opens the buses, which must be up, and plays every motor of the arm; the track's joints are in the order of the motors.
+    /// Once a client has switched one on, all of them stay with what clients want.
     pub fn start(track: &JointTrack, arm: &ArmConfig) -> Result<Self, Error> {
-        let mut motors = Self { stop: Arc::default(), threads: Vec::new() };
+        let mut motors = Self { signs: Arc::default(), threads: Vec::new() };
         for (bus_ix, bus) in arm.buses.iter().enumerate() {
             let own = arm.motors.iter().enumerate().filter(|(_, motor)| motor.bus_ix == bus_ix);
             let own = own.map(|(joint_ix, motor)| Shaft {
@@ -35,10 +44,10 @@ impl PlayedMotors {
                 motor: Played::new(motor.family, DAMIAO_LIMITS),
             });
             let (bus, own, track) = (Bus::open(bus)?, own.collect(), track.clone());
-            let stop = Arc::clone(&motors.stop);
+            let signs = Arc::clone(&motors.signs);
             let device = format!("played motors on {}", bus.config().interface);
             let thread = std::thread::Builder::new().name(device.clone()).spawn(move || {
-                if let Err(error) = play(&bus, own, &track, &stop) {
+                if let Err(error) = play(&bus, own, &track, &signs) {
                     log::error!("{error}");
                 }
             });
@@ -50,7 +59,7 @@ impl PlayedMotors {
 
 impl Drop for PlayedMotors {
     fn drop(&mut self) {
-        self.stop.store(true, Ordering::Relaxed);
+        self.signs.stop.store(true, Ordering::Relaxed);
         for thread in self.threads.drain(..) {
             // A thread that panicked has said so.
             let _ = thread.join();
@@ -79,13 +88,15 @@ impl Shaft {
     }
 }
 
-fn play(bus: &Bus, mut shafts: Vec<Shaft>, track: &JointTrack, stop: &AtomicBool) -> Result<(), Error> {
-    while !stop.load(Ordering::Relaxed) {
+fn play(bus: &Bus, mut shafts: Vec<Shaft>, track: &JointTrack, signs: &Signs) -> Result<(), Error> {
+    while !signs.stop.load(Ordering::Relaxed) {
         let arrived = bus.receive(TICK)?;
         let now = clock::now();
-        let joints = track.at(now);
+        let joints = (!signs.is_moved.load(Ordering::Relaxed)).then(|| track.at(now));
         for shaft in &mut shafts {
-            shaft.follow(&joints);
+            if let Some(joints) = &joints {
+                shaft.follow(joints);
+            }
             let answers = match &arrived {
                 Some((_, Arrived::Frame(frame))) => shaft.motor.take(frame),
                 _ => Ok(Vec::new()),
@@ -95,6 +106,9 @@ fn play(bus: &Bus, mut shafts: Vec<Shaft>, track: &JointTrack, stop: &AtomicBool
                     Ok(frames) => frames.iter().try_for_each(|frame| bus.send(frame).map(drop))?,
                     Err(error) => log::debug!("joint {:?}: {error}", shaft.config.joint),
                 }
+            }
+            if shaft.motor.state() != State::Free {
+                signs.is_moved.store(true, Ordering::Relaxed);
             }
         }
     }

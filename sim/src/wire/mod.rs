@@ -34,15 +34,14 @@ pub struct Script {
 }
 
 impl Script {
-    /// Takes what is played here; images and truths are given back.
-    pub fn take(&mut self, sample: Sample) -> Option<Sample> {
+    /// Takes what is played here; images and truths are not.
+    pub fn take(&mut self, sample: Sample) {
         match sample {
             Sample::Joints(state) => self.joints.push(state),
             Sample::Base(pose) => self.poses.push(pose),
             Sample::Range(scan) => self.scans.push(scan),
-            other => return Some(other),
+            Sample::Image(_) | Sample::Truth(_) | Sample::BaseTruth(_) => {}
         }
-        None
     }
 }
 

@@ -107,7 +107,8 @@ fn check(args: &Args) -> Result<(), BadArgument> {
 fn errors_millis(args: &Args, rate_hz: f64, seed: u64) -> Vec<f64> {
     let mut random = seed;
     let mut clock = ClockMap::new();
-    let n_readings = (args.seconds + args.fixed_millis * 1e-3 + args.jitter_millis * 1e-3 + 1.0) * f64::from(JOINT_RATE_HZ);
+    let n_readings =
+        (args.seconds + args.fixed_millis * 1e-3 + args.jitter_millis * 1e-3 + 1.0) * f64::from(JOINT_RATE_HZ);
     let mut joints = JointHistory::new(Duration::from_millis(100), n_readings.ceil() as usize + 1);
     for ix in 0..n_readings.ceil() as i64 {
         let stamp = Stamp(ix * 1_000_000_000 / i64::from(JOINT_RATE_HZ));
@@ -178,10 +179,16 @@ fn findings(args: &Args, found: &[Found]) -> anyhow::Result<Findings> {
         let y = 100.0 * share;
         Point { x: (ix as f64 + 0.5) * BIN_MILLIS - REACH_MILLIS, y, low: y, high: y }
     };
-    let line = |found: &Found| Line {
-        label: found.label(),
-        points: found.bars.iter().enumerate().map(point).collect(),
-        is_foreign: !found.is_calibrated,
+    let line = |found: &Found| {
+        // From the bar before the first that has any to the one behind the last.
+        let first = found.bars.iter().position(|share| *share > 0.0).unwrap_or(0).saturating_sub(1);
+        let n_behind = found.bars.iter().rev().position(|share| *share > 0.0).unwrap_or(0).saturating_sub(1);
+        let n_drawn = found.bars.len() - n_behind - first;
+        Line {
+            label: found.label(),
+            points: found.bars.iter().enumerate().skip(first).take(n_drawn).map(point).collect(),
+            is_foreign: !found.is_calibrated,
+        }
     };
     let conditions = format!(
         "{} ms fixed latency, 0 to {} ms of jitter, {} ppm of drift; {} runs of {} s, the first {} s left out",

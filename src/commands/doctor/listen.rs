@@ -89,7 +89,7 @@ pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Heard>
     let mut join = Join::new(&rig)?;
     let mut tracks: BTreeMap<String, Track> = BTreeMap::new();
     let mut findings = Vec::new();
-    let (began, cpu_began) = (Instant::now(), cpu_secs());
+    let (began, cpu_began) = (Instant::now(), clock::processor());
     while !stop.asked() && began.elapsed().as_secs_f64() < secs {
         let sample = match source.next_sample() {
             Ok(Some(sample)) => sample,
@@ -118,7 +118,7 @@ pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Heard>
             }
         }
     }
-    let (spent, cpu) = (began.elapsed(), cpu_secs() - cpu_began);
+    let (spent, cpu) = (began.elapsed(), clock::processor() - cpu_began);
     findings.push(Finding::ok("processor", cpu_told(cpu, spent)));
     let wanted = wanted(&rig);
     findings.extend(missing(&wanted, &tracks));
@@ -130,8 +130,7 @@ pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Heard>
         })
         .collect();
     findings.extend(devices.iter().filter_map(complaint));
-    let refused: Vec<_> =
-        join.counts().refused.iter().map(|(why, n)| format!("{n} {}", why.name())).collect();
+    let refused: Vec<_> = join.counts().refused.iter().map(|(why, n)| format!("{n} {}", why.name())).collect();
     if !refused.is_empty() {
         findings.push(Finding::ok("join", format!("images that became no keyframe: {}", refused.join(", "))));
     }
@@ -177,7 +176,9 @@ fn complaint(delivered: &Delivered) -> Option<Finding> {
         (Some(wanted), 0) => format!("{device} comes {rate_hz:.1} times a second, the rig file says {wanted:.1}"),
         (None, lost) => format!("{device} lost {lost} images"),
         (Some(wanted), lost) => {
-            format!("{device} comes {rate_hz:.1} times a second, the rig file says {wanted:.1}; {lost} images were lost")
+            format!(
+                "{device} comes {rate_hz:.1} times a second, the rig file says {wanted:.1}; {lost} images were lost"
+            )
         }
     };
     Some(Finding::warn("rate", says, "usual causes: bad light with automatic exposure, a slow bus, a busy processor"))
@@ -185,7 +186,9 @@ fn complaint(delivered: &Delivered) -> Option<Finding> {
 
 impl std::fmt::Display for Delivered {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { device, samples, rate_hz, latency_p50_millis: half, latency_p99_millis: most, gap_p99_millis, .. } = self;
+        let Self {
+            device, samples, rate_hz, latency_p50_millis: half, latency_p99_millis: most, gap_p99_millis, ..
+        } = self;
         write!(
             f,
             "{device}: {samples}, {rate_hz:.1} a second, {half:.1} ms old (99 %: {most:.1}) when they are here, \
@@ -195,14 +198,9 @@ impl std::fmt::Display for Delivered {
     }
 }
 
-/// Time that this process has kept processors busy, seconds.
-fn cpu_secs() -> f64 {
-    let spent = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
-    spent.tv_sec as f64 + spent.tv_nsec as f64 * 1e-9
-}
-
-fn cpu_told(cpu_secs: f64, spent: Duration) -> String {
-    format!("{:.1} % of one core was busy with reading and joining", 100.0 * cpu_secs / spent.as_secs_f64().max(1e-9))
+fn cpu_told(busy: Duration, spent: Duration) -> String {
+    let share = busy.as_secs_f64() / spent.as_secs_f64().max(1e-9);
+    format!("{:.1} % of one core was busy with reading and joining", 100.0 * share)
 }
 
 #[cfg(test)]

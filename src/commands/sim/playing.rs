@@ -3,7 +3,7 @@
 use super::Args;
 use crate::config::{ArmDriver, BaseDriver, Rig, ScannerDriver};
 use crate::exit::{BadArgument, Exit};
-use crate::open::{self, Devices};
+use crate::open::{self, Devices, Opened};
 use crate::print;
 use crate::stop::Stop;
 use anyhow::{Context, bail};
@@ -19,6 +19,8 @@ use std::time::Duration;
 
 /// The port of FCI.
 const FCI_PORT: u16 = 1337;
+/// What is simulated, beside the rig file.
+const SCRIPT_FILE: &str = "script.mcap";
 /// How soon Ctrl-C is noticed.
 const POLL: Duration = Duration::from_millis(50);
 
@@ -50,7 +52,14 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     check(&rig)?;
     let folder = args.out.clone().unwrap_or_else(|| PathBuf::from(format!("sim-{name}")));
     std::fs::create_dir_all(&folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
-    let Some(script) = script(args, &rig, &stop)? else { return Ok(Exit::Done) };
+    let recording = match &args.from {
+        Some(path) => path.clone(),
+        None => match simulate(args, &rig, &folder, &stop)? {
+            Some(path) => path,
+            None => return Ok(Exit::Done),
+        },
+    };
+    let script = script(&recording, args.seconds)?;
     let first = script.joints.first().map(|state| state.stamp);
     let first = first.or(script.poses.first().map(|pose| pose.stamp)).unwrap_or_default();
     let clockwork = Clockwork { scripted: first, played: clock::now().plus_secs(args.start_in) };
@@ -99,18 +108,13 @@ fn check(rig: &Rig) -> Result<(), BadArgument> {
     Ok(())
 }
 
-/// What the devices say; `None` where that was interrupted.
-fn script(args: &Args, rig: &Rig, stop: &Stop) -> anyhow::Result<Option<Script>> {
-    let opened = match &args.from {
-        Some(path) => open::recording(path, None, &[])?,
-        None => {
-            let mut simulated = rig.clone();
-            simulated.sim.lockstep = true;
-            open::rig(simulated, Devices::Sim)?
-        }
-    };
-    let mut source = opened.source;
-    let mut script = Script::default();
+/// Simulates the rig into a recording; `None` where that was interrupted.
+fn simulate(args: &Args, rig: &Rig, folder: &Path, stop: &Stop) -> anyhow::Result<Option<PathBuf>> {
+    let mut simulated = rig.clone();
+    simulated.sim.lockstep = true;
+    let Opened { rig, mut source, .. } = open::rig(simulated, Devices::Sim)?;
+    let path = folder.join(SCRIPT_FILE);
+    let mut recorder = open::recorder(&path, &rig)?;
     let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
     let mut first: Option<Stamp> = None;
     while let Some(sample) = source.next_sample()? {
@@ -122,10 +126,25 @@ fn script(args: &Args, rig: &Rig, stop: &Stop) -> anyhow::Result<Option<Script>>
             return Ok(None);
         }
         bar.set_message(format!("{secs:.1} of {:.1} s simulated", args.seconds));
+        recorder.write(&sample)?;
+    }
+    recorder.finish()?;
+    bar.finish_and_clear();
+    Ok(Some(path))
+}
+
+/// What the devices of a recording say but for its cameras, in its first `secs`.
+fn script(recording: &Path, secs: f64) -> anyhow::Result<Script> {
+    let mut source = open::recording(recording, None, &[])?.source;
+    let mut script = Script::default();
+    let mut first: Option<Stamp> = None;
+    while let Some(sample) = source.next_sample()? {
+        if sample.stamp().secs_since(*first.get_or_insert(sample.stamp())) > secs {
+            break;
+        }
         script.take(sample);
     }
-    bar.finish_and_clear();
-    Ok(Some(script))
+    Ok(script)
 }
 
 /// The rig file that runs against what is played, the robot's description beside it.
