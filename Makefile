@@ -4,10 +4,13 @@
 # the page's npm packages) and says so; without root it prints the one line to run.
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test hil check deps web cargo packages hil-packages mujoco open-ends
+.PHONY: help demo test hil check deps web cargo packages hil-packages mujoco realsense open-ends
 
 # One feature set everywhere, so that dependencies compile once.
 FEATURES := --features sim
+
+# Tests have RealSense cameras beside that, where there is a library for them: see `realsense`.
+TEST_FEATURES = $(FEATURES)$(shell [ -e .deps/realsense/made-of ] && echo ,realsense)
 
 # The rig that `make demo` simulates: a file of the folder rigs.
 RIG ?= static-arm
@@ -22,18 +25,18 @@ demo: deps web ## Simulate a rig (RIG=static-arm, mobile-arm, mobile-base-small,
 	target/release/fieldrig run rigs/$(RIG).toml --sim
 
 test: check web hil-packages ## Lints, documentation and every test that needs no device
-	cargo test --workspace $(FEATURES) --no-fail-fast
+	cargo test --workspace $(TEST_FEATURES) --no-fail-fast
 
 hil: cargo packages web ## Check the rig RIG=file.toml on whatever is plugged in: everything is read for LISTEN_SECONDS=20, nothing is moved
-	cargo build --release
+	cargo build --release $(shell pkg-config --exists realsense2 2>/dev/null && echo --features realsense)
 	target/release/fieldrig doctor $(if $(filter file,$(origin RIG)),$(error say which rig: make hil RIG=file.toml),$(RIG)) --listen $(LISTEN_SECONDS)
 
-check: deps open-ends ## Format, clippy, documentation, kernels, licences, open ends
+check: deps realsense open-ends ## Format, clippy, documentation, kernels, licences, open ends
 	cargo fmt --all --check
-	cargo clippy --workspace --all-targets $(FEATURES) -- -D warnings
+	cargo clippy --workspace --all-targets $(TEST_FEATURES) -- -D warnings
 	cargo clippy --workspace --exclude sim --all-targets -- -D warnings
-	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps $(FEATURES)
-	cargo test --workspace $(FEATURES) --lib every_kernel_parses_and_validates
+	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps $(TEST_FEATURES)
+	cargo test --workspace $(TEST_FEATURES) --lib every_kernel_parses_and_validates
 	@if cargo deny --version >/dev/null 2>&1; then \
 		cargo deny check licenses bans sources || exit 1; \
 		if cargo deny fetch db >/dev/null 2>&1; then cargo deny check advisories; \
@@ -58,6 +61,11 @@ hil-packages: packages
 
 mujoco: packages
 	@scripts/fetch-mujoco.sh
+
+# Where it cannot be had, what needs it is left out, with a line, unless FIELDRIG_HIL=demand.
+realsense: packages
+	@scripts/install-packages.sh realsense && scripts/fetch-realsense.sh || { [ "$$FIELDRIG_HIL" != demand ] && \
+	echo "skipped: tests of RealSense cameras"; }
 
 open-ends:
 	@scripts/check-open-ends.sh

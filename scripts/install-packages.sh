@@ -2,7 +2,7 @@
 # Installs the system packages that are missing, and only those, with apt; says which and why.
 # Without root it prints the one line to run and stops; where a package is there already it does nothing.
 #
-# usage: install-packages.sh GROUP...      groups: build gpu sim web hil
+# usage: install-packages.sh GROUP...      groups: build gpu sim web realsense hil
 set -eu
 
 missing=""
@@ -54,6 +54,15 @@ for group in "$@"; do
         need_command node nodejs "bundles the web page"
         need_command npm npm "fetches what the web page is made of"
         ;;
+    realsense)
+        need_library libusb-1.0.so.0 libusb-1.0-0 "how librealsense2 speaks to cameras"
+        need_library libudev.so.1 libudev1 "how librealsense2 finds cameras"
+        need_command patchelf patchelf "names the pinned librealsense2 as programs look for it"
+        need_command nm binutils "lists what the pinned librealsense2 wants of Python"
+        if ! python3 -m pip --version >/dev/null 2>&1; then
+            need python3-pip "downloads the RealSense wheel"
+        fi
+        ;;
     hil)
         # The virtual kernel of tests/hil is built of Debian 12's source; elsewhere its tests are skipped, with a line.
         if ! grep -q '^VERSION_CODENAME=bookworm$' /etc/os-release 2>/dev/null || [ "$(uname -m)" != x86_64 ]; then
@@ -71,7 +80,7 @@ for group in "$@"; do
         need python3-venv "holds the peers of Franka arms"
         ;;
     *)
-        echo "install-packages: unknown group $group (build, gpu, sim, web, hil)" >&2
+        echo "install-packages: unknown group $group (build, gpu, sim, web, realsense, hil)" >&2
         exit 2
         ;;
     esac

@@ -43,6 +43,20 @@ pub enum Error {
         /// What is wrong.
         problem: Box<crate::v4l2::Problem>,
     },
+    /// A RealSense camera or a file of one cannot be opened, or was lost for good.
+    #[error("camera {camera:?}: {problem}")]
+    Realsense {
+        /// Name in the rig file.
+        camera: String,
+        /// What is wrong.
+        problem: Box<crate::realsense::Problem>,
+    },
+    /// The file that a camera was played from is at its end.
+    #[error("camera {camera:?}: its file is at the end")]
+    Ended {
+        /// Name in the rig file.
+        camera: String,
+    },
     /// A camera was lost and is looked for; asking again may find it.
     #[error("camera {camera:?}: lost for {waited:?}, looking for it")]
     Reconnecting {

@@ -11,6 +11,7 @@ pub mod franka;
 pub mod jpeg;
 mod live;
 pub mod motion;
+pub mod realsense;
 pub mod recording;
 mod sample;
 pub mod udp;
@@ -37,7 +38,13 @@ pub trait Camera: Send {
     ///
     /// A slow caller loses the oldest images; the loss is counted in [`Image::n_skipped`]. A camera that was unplugged and is
     /// looked for says [`Error::Reconnecting`], for a bounded time.
+    ///
+    /// A camera that is played from a file says [`Error::Ended`] at the end.
     fn next_image(&mut self, timeout: Duration) -> Result<Image, Error>;
+    /// Whether it waits for a slow caller instead of losing images, as a file can that is played as fast as it is taken.
+    fn waits_for_caller(&self) -> bool {
+        false
+    }
 }
 
 /// An arm whose joints can be read.

@@ -33,8 +33,9 @@ pub struct Devices {
 /// All devices of a rig, read by a thread each.
 ///
 /// A slow caller loses the oldest samples of a device: images are counted in [`Image::n_skipped`] of the next image of the
-/// same kind, everything else in [`Live::n_others_dropped`]. The first error of a device is returned once by
-/// [`Source::next_sample`] and ends the source. Dropping it stops the threads.
+/// same kind, everything else in [`Live::n_others_dropped`]; a camera that waits for its caller is made to wait. The first error of
+/// a device is returned once by [`Source::next_sample`] and ends the source. So does the end of the last camera, where cameras are
+/// played from files: what was read until then still comes. Dropping it stops the threads.
 #[derive(Debug)]
 pub struct Live {
     shared: Arc<Shared>,
@@ -45,6 +46,8 @@ pub struct Live {
 struct Shared {
     state: Mutex<State>,
     arrived: Condvar,
+    /// A sample was taken, or all is to stop.
+    taken: Condvar,
 }
 
 #[derive(Debug, Default)]
@@ -57,6 +60,9 @@ struct State {
     error: Option<Error>,
     failed: bool,
     n_running: usize,
+    /// Cameras whose images have not come to an end.
+    n_cameras: usize,
+    /// No device is read any more; what waits may still be taken.
     stop: bool,
 }
 
@@ -69,33 +75,34 @@ impl Live {
             queues: vec![VecDeque::new(); n_devices],
             dropped: vec![[0; 2]; n_devices],
             n_running: n_devices,
+            n_cameras: cameras.len(),
             ..State::default()
         };
         let mut live = Self {
-            shared: Arc::new(Shared { state: Mutex::new(state), arrived: Condvar::new() }),
+            shared: Arc::new(Shared { state: Mutex::new(state), arrived: Condvar::new(), taken: Condvar::new() }),
             threads: Vec::new(),
         };
         for mut camera in cameras {
             let name = camera.name().to_owned();
             let silent = move |waited| Error::NoImage { camera: name.clone(), waited };
-            live.read(format!("camera {:?}", camera.name()), MAX_IMAGES, silent, move || {
-                match camera.next_image(POLL) {
-                    Err(Error::NoImage { .. }) => Ok(Heard::Nothing),
-                    Err(Error::Reconnecting { .. }) => Ok(Heard::Mending),
-                    image => image.map(Sample::Image).map(Heard::Sample),
-                }
+            let room = Room { max_waiting: MAX_IMAGES, is_waited_for: camera.waits_for_caller() };
+            live.read(format!("camera {:?}", camera.name()), room, silent, move || match camera.next_image(POLL) {
+                Err(Error::Ended { .. }) => Ok(Heard::End),
+                Err(Error::NoImage { .. }) => Ok(Heard::Nothing),
+                Err(Error::Reconnecting { .. }) => Ok(Heard::Mending),
+                image => image.map(Sample::Image).map(Heard::Sample),
             })?;
         }
         if let Some(mut arm) = arm {
             let silent = |waited| Error::NoJoints { waited };
-            live.read("arm".to_owned(), MAX_JOINTS, silent, move || match arm.read(POLL) {
+            live.read("arm".to_owned(), Room::losing(MAX_JOINTS), silent, move || match arm.read(POLL) {
                 Err(Error::NoJoints { .. }) => Ok(Heard::Nothing),
                 state => state.map(Sample::Joints).map(Heard::Sample),
             })?;
         }
         if let Some(mut base) = base {
             let silent = |waited| Error::NoBasePose { waited };
-            live.read("base".to_owned(), MAX_JOINTS, silent, move || match base.next_pose(POLL) {
+            live.read("base".to_owned(), Room::losing(MAX_JOINTS), silent, move || match base.next_pose(POLL) {
                 Err(Error::NoBasePose { .. }) => Ok(Heard::Nothing),
                 pose => pose.map(Sample::Base).map(Heard::Sample),
             })?;
@@ -104,7 +111,7 @@ impl Live {
             let name = scanner.name().to_owned();
             let silent = move |waited| Error::NoScan { scanner: name.clone(), waited };
             let device = format!("range scanner {:?}", scanner.name());
-            live.read(device, MAX_SCANS, silent, move || match scanner.next_scan(POLL) {
+            live.read(device, Room::losing(MAX_SCANS), silent, move || match scanner.next_scan(POLL) {
                 Err(Error::NoScan { .. }) => Ok(Heard::Nothing),
                 scan => scan.map(Sample::Range).map(Heard::Sample),
             })?;
@@ -116,12 +123,12 @@ impl Live {
     fn read(
         &mut self,
         device: String,
-        max_waiting: usize,
+        room: Room,
         silent: impl Fn(Duration) -> Error + Send + 'static,
         read: impl FnMut() -> Result<Heard, Error> + Send + 'static,
     ) -> Result<(), Error> {
         let device_ix = self.threads.len();
-        self.spawn(device, move |shared| read_until_stopped(shared, device_ix, max_waiting, read, silent))
+        self.spawn(device, move |shared| read_until_stopped(shared, device_ix, room, read, silent))
     }
 
     /// Joint readings, base poses and range scans lost so far because the caller was slow.
@@ -141,6 +148,20 @@ impl Live {
     }
 }
 
+/// What lies between a device and a slow caller.
+#[derive(Clone, Copy)]
+struct Room {
+    max_waiting: usize,
+    /// The device waits where there is none; else its oldest sample goes.
+    is_waited_for: bool,
+}
+
+impl Room {
+    fn losing(max_waiting: usize) -> Self {
+        Self { max_waiting, is_waited_for: false }
+    }
+}
+
 /// What one wait on a device led to.
 enum Heard {
     Sample(Sample),
@@ -148,13 +169,15 @@ enum Heard {
     Nothing,
     /// It is lost, and its driver looks for it: how long, the driver bounds.
     Mending,
+    /// It is a file, and that is at its end.
+    End,
 }
 
 /// The loop of one device's thread: `read` waits [`POLL`].
 fn read_until_stopped(
     shared: &Shared,
     device_ix: usize,
-    max_waiting: usize,
+    room: Room,
     mut read: impl FnMut() -> Result<Heard, Error>,
     silent: impl Fn(Duration) -> Error,
 ) {
@@ -168,9 +191,17 @@ fn read_until_stopped(
         let error = match sample {
             Ok(Heard::Sample(sample)) => {
                 waited = Duration::ZERO;
-                state.put(device_ix, max_waiting, sample);
+                while room.is_waited_for && state.queues[device_ix].len() >= room.max_waiting && !state.stop {
+                    state = shared.taken.wait(state).unwrap_or_else(PoisonError::into_inner);
+                }
+                state.put(device_ix, room.max_waiting, sample);
                 shared.arrived.notify_all();
                 continue;
+            }
+            Ok(Heard::End) => {
+                state.n_cameras -= 1;
+                state.stop |= state.n_cameras == 0;
+                return;
             }
             Ok(Heard::Mending) => {
                 waited = Duration::ZERO;
@@ -240,9 +271,10 @@ impl Source for Live {
                 return Err(error);
             }
             if let Some(sample) = state.take() {
+                self.shared.taken.notify_all();
                 return Ok(Some(sample));
             }
-            if state.failed || state.n_running == 0 {
+            if state.failed || state.stop || state.n_running == 0 {
                 return Ok(None);
             }
             state = self.shared.arrived.wait(state).unwrap_or_else(PoisonError::into_inner);
@@ -253,6 +285,7 @@ impl Source for Live {
 impl Drop for Live {
     fn drop(&mut self) {
         self.shared.lock().stop = true;
+        self.shared.taken.notify_all();
         for thread in self.threads.drain(..) {
             // A thread that panicked has printed why; there is nothing left to stop.
             let _ = thread.join();
@@ -383,6 +416,45 @@ mod tests {
         // The image came after ten seconds of looking, and the error is the one after it.
         assert!(live.next_sample().expect_err("the cable").to_string().contains("cable pulled"));
         assert_eq!(live.next_sample().expect("told once").expect("an image").stamp(), Stamp(1));
+    }
+
+    /// A camera that is played from a file as fast as it is taken.
+    struct Recorded(Fast);
+
+    impl Camera for Recorded {
+        fn name(&self) -> &str {
+            "recorded"
+        }
+        fn intrinsics(&self) -> &Intrinsics {
+            self.0.intrinsics()
+        }
+        fn next_image(&mut self, timeout: Duration) -> Result<Image, Error> {
+            if self.0.next == self.0.n_images {
+                return Err(Error::Ended { camera: "recorded".into() });
+            }
+            self.0.next_image(timeout)
+        }
+        fn waits_for_caller(&self) -> bool {
+            true
+        }
+    }
+
+    #[test]
+    fn a_file_waits_for_a_slow_caller_and_its_end_ends_the_source() {
+        let n_images = 5 * i64::try_from(MAX_IMAGES).expect("a small number");
+        let camera = Recorded(Fast { intrinsics: LENS, n_images, next: 0 });
+        // The arm would go on for ever.
+        let arm: Box<dyn Arm> = Box::new(Still { next: 0 });
+        let devices = Devices { cameras: vec![Box::new(camera)], arm: Some(arm), ..Devices::default() };
+        let mut live = Live::new(devices).expect("threads start");
+        let mut stamps = Vec::new();
+        while let Some(sample) = live.next_sample().expect("an end is no error") {
+            if let Sample::Image(image) = sample {
+                assert_eq!(image.n_skipped, 0);
+                stamps.push(image.stamp.0);
+            }
+        }
+        assert_eq!(stamps, (1..=n_images).collect::<Vec<_>>());
     }
 
     #[test]

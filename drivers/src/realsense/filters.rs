@@ -1,0 +1,61 @@
+//! The library's filters on depth images, those that a rig file names, set up as the library sets them up.
+
+use super::sdk::{Frame, as_depth};
+use super::{Filter, Problem};
+use realsense_rust::frame::DepthFrame;
+use realsense_rust::processing_blocks::hole_filling::HoleFillingFilter;
+use realsense_rust::processing_blocks::spatial_filter::SpatialFilter;
+use realsense_rust::processing_blocks::temporal_filter::TemporalFilter;
+use std::fmt::Display;
+use std::time::Duration;
+
+/// Filters work on the caller's thread, so what they made is there at once.
+const MAX_WORK: Duration = Duration::from_secs(1);
+
+/// Filters in the order in which depth passes them.
+#[derive(Debug, Default)]
+pub(super) struct Filters(Vec<Block>);
+
+#[derive(Debug)]
+enum Block {
+    Spatial(SpatialFilter),
+    Temporal(TemporalFilter),
+    HoleFilling(HoleFillingFilter),
+}
+
+// SAFETY: the library may be called from any thread, one after the other; blocks are never cloned, so we hold the only pointers.
+#[expect(unsafe_code, reason = "the wrapper forgot to say so")]
+unsafe impl Send for Filters {}
+
+impl Filters {
+    pub(super) fn new(filters: &[Filter]) -> Result<Self, Problem> {
+        let block = |filter: &Filter| match filter {
+            Filter::Spatial => SpatialFilter::new(1).map(Block::Spatial).map_err(refused),
+            Filter::Temporal => TemporalFilter::new(1).map(Block::Temporal).map_err(refused),
+            Filter::HoleFilling => HoleFillingFilter::new(1).map(Block::HoleFilling).map_err(refused),
+        };
+        filters.iter().map(block).collect::<Result<_, _>>().map(Self)
+    }
+
+    pub(super) fn are_none(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// A depth image that has passed all of them.
+    pub(super) fn pass(&mut self, frame: Frame) -> Result<DepthFrame, Problem> {
+        let mut frame = as_depth(frame)?;
+        for block in &mut self.0 {
+            frame = match block {
+                Block::Spatial(filter) => filter.queue(frame).and_then(|()| filter.wait(MAX_WORK)),
+                Block::Temporal(filter) => filter.queue(frame).and_then(|()| filter.wait(MAX_WORK)),
+                Block::HoleFilling(filter) => filter.queue(frame).and_then(|()| filter.wait(MAX_WORK)),
+            }
+            .map_err(refused)?;
+        }
+        Ok(frame)
+    }
+}
+
+fn refused(error: impl Display) -> Problem {
+    Problem::Library { what: "filter depth", reason: error.to_string() }
+}

@@ -1,0 +1,96 @@
+//! RealSense cameras that are plugged in, and what is wrong with them.
+
+use super::Problem;
+use super::sdk::{Context, Device};
+use realsense_rust::kind::Rs2CameraInfo;
+
+/// A camera that is plugged in.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Found {
+    /// What it calls itself.
+    pub name: String,
+    /// Its serial number, which a rig file names.
+    pub serial: String,
+    /// Version of its firmware.
+    pub firmware: String,
+    /// Version that the library wants, where it says so.
+    pub recommended_firmware: Option<String>,
+    /// Version of USB that it runs at, like `3.2`.
+    pub usb: Option<String>,
+}
+
+impl Found {
+    pub(super) fn of(device: &Device) -> Self {
+        let info = |kind| device.info.info(kind).map(|text| text.to_string_lossy().into_owned());
+        Self {
+            name: info(Rs2CameraInfo::Name).unwrap_or_else(|| "RealSense".into()),
+            serial: info(Rs2CameraInfo::SerialNumber).unwrap_or_default(),
+            firmware: info(Rs2CameraInfo::FirmwareVersion).unwrap_or_default(),
+            recommended_firmware: info(Rs2CameraInfo::RecommendedFirmwareVersion),
+            usb: info(Rs2CameraInfo::UsbTypeDescriptor),
+        }
+    }
+
+    /// Whether it runs at USB 2, which carries few of its modes.
+    pub fn is_on_usb2(&self) -> bool {
+        self.usb.as_deref().is_some_and(|usb| usb.starts_with('2') || usb.starts_with('1'))
+    }
+
+    /// Whether its firmware is older than the library wants.
+    pub fn has_old_firmware(&self) -> bool {
+        let numbers = |version: &str| version.split('.').map(|part| part.parse().unwrap_or(0)).collect::<Vec<u32>>();
+        self.recommended_firmware.as_deref().is_some_and(|wanted| numbers(&self.firmware) < numbers(wanted))
+    }
+
+    /// Name and serial number, for people.
+    pub(super) fn describe(&self) -> String {
+        format!("{} {}", self.name, self.serial)
+    }
+}
+
+/// All that are plugged in.
+pub fn cameras() -> Result<Vec<Found>, Problem> {
+    Ok(Context::new()?.devices()?.iter().map(Found::of).collect())
+}
+
+/// The camera with a serial number, or the only one that there is where that is empty.
+pub(super) fn camera(context: &Context, serial: &str) -> Result<Device, Problem> {
+    let mut devices = context.devices()?;
+    let found: Vec<Found> = devices.iter().map(Found::of).collect();
+    let fits = |found: &Found| serial.is_empty() || found.serial == serial;
+    let there = || found.iter().map(Found::describe).collect();
+    match found.iter().filter(|found| fits(found)).count() {
+        0 => Err(Problem::NoDevice { serial: serial.to_owned(), there: there() }),
+        1 => Ok(devices.swap_remove(found.iter().position(fits).expect("it was counted"))),
+        _ => Err(Problem::Ambiguous { there: there() }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn old_firmware_and_slow_ports_are_seen() {
+        let found = |firmware: &str, wanted: Option<&str>, usb: Option<&str>| Found {
+            name: "Intel RealSense D435I".into(),
+            serial: "123".into(),
+            firmware: firmware.into(),
+            recommended_firmware: wanted.map(str::to_owned),
+            usb: usb.map(str::to_owned),
+        };
+        assert!(found("5.9.15.1", Some("5.16.0.1"), None).has_old_firmware());
+        assert!(!found("5.16.0.1", Some("5.16.0.1"), None).has_old_firmware());
+        assert!(!found("5.17.0.9", Some("5.16.0.1"), None).has_old_firmware());
+        assert!(!found("5.9.15.1", None, None).has_old_firmware());
+        assert!(found("", None, Some("2.1")).is_on_usb2());
+        assert!(!found("", None, Some("3.2")).is_on_usb2() && !found("", None, None).is_on_usb2());
+    }
+
+    #[test]
+    fn a_camera_that_is_not_plugged_in_is_named() {
+        let context = Context::new().expect("the library starts without a camera");
+        let message = camera(&context, "no such serial").expect_err("none is there").to_string();
+        assert!(message.contains("no such serial"), "{message}");
+    }
+}

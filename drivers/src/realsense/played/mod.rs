@@ -1,0 +1,376 @@
+//! A RealSense camera that is played into a file: a software device of the library, recorded by the library's own recorder, so that
+//! the file is like any other that it writes.
+
+#![expect(unsafe_code, reason = "the border to a C library")]
+
+mod abi;
+
+use super::sdk::{Context, Device, Mode, Modes, Queue, Sensor, call, made, path_name};
+use super::{Problem, lens};
+use crate::{Image, PixelFormat, YuvLayout};
+use abi::{VideoFrame, VideoStream};
+use kinematics::{Intrinsics, Transform};
+use realsense_sys as sys;
+use std::collections::BTreeMap;
+use std::ffi::{CStr, CString, c_void};
+use std::path::{Path, PathBuf};
+use std::ptr::NonNull;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+/// Images that the library may still have to write: it drops what it cannot keep, so it is waited for.
+const MAX_UNWRITTEN: usize = 16;
+/// A disk that takes no image for this long is full, or gone.
+const MAX_WAIT: Duration = Duration::from_secs(30);
+/// How often it is looked for whether images were written.
+const LOOK: Duration = Duration::from_millis(1);
+/// As the D400 family names its sensors; it counts the exposure of the second one in 100 us.
+const DEPTH_SENSOR: &CStr = c"Stereo Module";
+const IMAGE_SENSOR: &CStr = c"RGB Camera";
+const IMAGE_EXPOSURE_SECS: f64 = 100e-6;
+const DEPTH_EXPOSURE_SECS: f64 = 1e-6;
+const NANOS_PER_MILLI: f64 = 1e6;
+const NANOS_PER_MICRO: i64 = 1000;
+
+/// The camera that a file pretends to be of.
+#[derive(Clone, Debug)]
+pub struct PlayedCamera {
+    /// What it calls itself.
+    pub name: String,
+    /// Its serial number.
+    pub serial: String,
+    /// Images a second.
+    pub rate_hz: u16,
+    /// Lens of the colour images.
+    pub intrinsics: Intrinsics,
+    /// How their bytes are to be read: [`PixelFormat::Rgb8`], `Bgr8`, or `Yuv` with two bytes a pixel.
+    pub format: PixelFormat,
+    /// Its depth.
+    pub depth: Option<PlayedDepth>,
+}
+
+/// Depth of such a camera.
+#[derive(Clone, Debug)]
+pub struct PlayedDepth {
+    /// Its lens.
+    pub intrinsics: Intrinsics,
+    /// Pose of the depth camera in the frame of the colour camera.
+    pub camera_from_depth: Transform,
+    /// Metres per count.
+    pub metres_per_count: f64,
+}
+
+/// A file that is being written; [`BagWriter::finish`] ends it.
+#[derive(Debug)]
+pub struct BagWriter {
+    path: PathBuf,
+    /// Among all files of this program.
+    number: u64,
+    /// The modes point into the recorder's sensors.
+    _modes: Vec<Modes>,
+    recorder: Device,
+    queue: Queue,
+    color: Played,
+    depth: Option<Played>,
+    _camera: Device,
+    _context: Context,
+}
+
+/// One stream of the played camera.
+#[derive(Debug)]
+struct Played {
+    sensor: NonNull<sys::rs2_sensor>,
+    profile: NonNull<sys::rs2_stream_profile>,
+    format: PixelFormat,
+    bytes_per_pixel: i32,
+    size_px: [u32; 2],
+    exposure_secs_per_count: f64,
+    n_images: i32,
+}
+
+// SAFETY: the library may be called from any thread, and what these point to lives in `BagWriter::_camera`.
+unsafe impl Send for Played {}
+
+impl BagWriter {
+    /// Begins a file; one of that name is replaced.
+    pub fn create(path: &Path, camera: &PlayedCamera) -> Result<Self, Problem> {
+        let context = Context::new()?;
+        let _ = std::fs::remove_file(path); // Not there, mostly; what cannot be removed the library cannot write, and says so.
+        // SAFETY: the device is checked and then ours; sensors and profiles live as long as it does.
+        let device = unsafe {
+            let device = call("make a software device", |error| abi::rs2_create_software_device(error))?;
+            register(device, camera)?;
+            device
+        };
+        // SAFETY: as above; sensors that are added live in the device.
+        let (color, depth) = unsafe {
+            let depth = camera.depth.as_ref().map(|depth| Played::depth(device, camera, depth)).transpose()?;
+            let color = Played::color(device, camera)?;
+            if let (Some(played), Some(depth)) = (&depth, &camera.depth) {
+                let extrinsics = lens::extrinsics(&depth.camera_from_depth);
+                call("place two cameras", |error| {
+                    sys::rs2_register_extrinsics(played.profile.as_ptr(), color.profile.as_ptr(), extrinsics, error);
+                })?;
+            }
+            (color, depth)
+        };
+        // SAFETY: nobody else frees it.
+        let device = unsafe { Device::new(device)? };
+        let refused = |reason: String| Problem::File { path: path.to_owned(), reason };
+        let name = path_name(path).map_err(refused)?;
+        // SAFETY: device and name live; the recorder is then ours and keeps the device.
+        let recorder = unsafe {
+            let recorder =
+                call("record", |error| sys::rs2_create_record_device_ex(device.as_ptr(), name.as_ptr(), 1, error));
+            Device::new(recorder.map_err(|problem| refused(problem.to_string()))?)?
+        };
+        let mut writer = Self {
+            path: path.to_owned(),
+            number: N_FILES.fetch_add(1, Ordering::Relaxed),
+            _modes: Vec::new(),
+            recorder,
+            queue: Queue::new(u8::try_from(MAX_UNWRITTEN).expect("a small number"))?,
+            color,
+            depth,
+            _camera: device,
+            _context: context,
+        };
+        writer.start()?;
+        Ok(writer)
+    }
+
+    fn start(&mut self) -> Result<(), Problem> {
+        for sensor in &self.recorder.sensors {
+            self._modes.push(sensor.modes()?);
+        }
+        for (sensor, modes) in self.recorder.sensors.iter().zip(&self._modes) {
+            sensor.open(&modes.modes.iter().collect::<Vec<&Mode>>())?;
+        }
+        self.recorder.sensors.iter().try_for_each(|sensor: &Sensor| sensor.start(&self.queue))
+    }
+
+    /// Writes one image, colour or depth; its stamp becomes mid-exposure by the camera's clock, in whole microseconds.
+    ///
+    /// Fails where the image is not what the camera was said to give, or the disk takes nothing more.
+    pub fn write(&mut self, image: &Image) -> Result<(), Problem> {
+        let refused = |reason: String| Problem::File { path: self.path.clone(), reason };
+        let played = match (image.is_depth(), &mut self.depth) {
+            (true, Some(depth)) => depth,
+            (true, None) => return Err(refused("the played camera has no depth".into())),
+            (false, _) => &mut self.color,
+        };
+        if image.format != played.format || image.size_px != played.size_px {
+            let (got, wanted) = (format!("{:?} {:?}", image.format, image.size_px), (played.format, played.size_px));
+            return Err(refused(format!("an image is {got}, the played camera gives {:?} {:?}", wanted.0, wanted.1)));
+        }
+        let bytes = image.raw_bytes().map_err(|error| refused(error.to_string()))?;
+        played.send(self.number, image, bytes)?;
+        // What was recorded comes out of the recorder, too, and is lent as long as it is not freed.
+        wait_until_written(&self.path, self.number, MAX_UNWRITTEN, || self.queue.empty())
+    }
+
+    /// Ends the file: everything is in it then.
+    pub fn finish(self) -> Result<(), Problem> {
+        self.queue.empty()?;
+        self.recorder.sensors.iter().for_each(Sensor::stop);
+        let (path, number) = (self.path.clone(), self.number);
+        drop(self);
+        wait_until_written(&path, number, 0, || Ok(()))
+    }
+}
+
+/// Tells the library who the camera is.
+///
+/// # Safety
+/// The pointer must be a software device.
+unsafe fn register(device: *mut sys::rs2_device, camera: &PlayedCamera) -> Result<(), Problem> {
+    let text = |text: &str| {
+        CString::new(text)
+            .map_err(|error| Problem::Library { what: "take the name of a camera", reason: error.to_string() })
+    };
+    let infos = [
+        (sys::rs2_camera_info_RS2_CAMERA_INFO_NAME, text(&camera.name)?),
+        (sys::rs2_camera_info_RS2_CAMERA_INFO_SERIAL_NUMBER, text(&camera.serial)?),
+        (sys::rs2_camera_info_RS2_CAMERA_INFO_PRODUCT_LINE, c"D400".to_owned()),
+    ];
+    for (info, value) in &infos {
+        // SAFETY: the device lives by the caller's word, and the text is copied.
+        call("name a software device", |error| unsafe {
+            abi::rs2_software_device_register_info(device, *info, value.as_ptr(), error);
+        })?;
+    }
+    Ok(())
+}
+
+impl Played {
+    /// # Safety
+    /// The pointer must be a software device that outlives this.
+    unsafe fn color(device: *mut sys::rs2_device, camera: &PlayedCamera) -> Result<Self, Problem> {
+        let format = match camera.format {
+            PixelFormat::Rgb8 => Some((sys::rs2_format_RS2_FORMAT_RGB8, 3)),
+            PixelFormat::Bgr8 => Some((sys::rs2_format_RS2_FORMAT_BGR8, 3)),
+            PixelFormat::Yuv { layout: YuvLayout::Yuyv, .. } => Some((sys::rs2_format_RS2_FORMAT_YUYV, 2)),
+            PixelFormat::Yuv { layout: YuvLayout::Uyvy, .. } => Some((sys::rs2_format_RS2_FORMAT_UYVY, 2)),
+            _ => None,
+        };
+        let Some((format, bytes_per_pixel)) = format else {
+            let reason = format!("{:?} is no format of a RealSense camera", camera.format);
+            return Err(Problem::Library { what: "play images", reason });
+        };
+        let stream = stream(sys::rs2_stream_RS2_STREAM_COLOR, 1, camera.rate_hz, &camera.intrinsics);
+        let stream = VideoStream { bytes_per_pixel, format, ..stream };
+        // SAFETY: by the caller's word.
+        unsafe { Self::add(device, IMAGE_SENSOR, stream, camera.format, IMAGE_EXPOSURE_SECS) }
+    }
+
+    /// # Safety
+    /// The pointer must be a software device that outlives this.
+    unsafe fn depth(device: *mut sys::rs2_device, camera: &PlayedCamera, depth: &PlayedDepth) -> Result<Self, Problem> {
+        let stream = stream(sys::rs2_stream_RS2_STREAM_DEPTH, 2, camera.rate_hz, &depth.intrinsics);
+        let stream = VideoStream { bytes_per_pixel: 2, format: sys::rs2_format_RS2_FORMAT_Z16, ..stream };
+        let format = PixelFormat::DepthU16 { metres_per_count: depth.metres_per_count };
+        // SAFETY: by the caller's word; the sensor lives in the device.
+        unsafe {
+            let played = Self::add(device, DEPTH_SENSOR, stream, format, DEPTH_EXPOSURE_SECS)?;
+            let (units, scale) = (sys::rs2_option_RS2_OPTION_DEPTH_UNITS, narrow(depth.metres_per_count));
+            call("set depth units", |error| {
+                abi::rs2_software_sensor_add_read_only_option(played.sensor.as_ptr(), units, scale, error);
+            })?;
+            Ok(played)
+        }
+    }
+
+    /// # Safety
+    /// The pointer must be a software device that outlives this.
+    unsafe fn add(
+        device: *mut sys::rs2_device,
+        name: &CStr,
+        stream: VideoStream,
+        format: PixelFormat,
+        exposure_secs_per_count: f64,
+    ) -> Result<Self, Problem> {
+        const WHAT: &str = "make a stream";
+        // SAFETY: device and name live; sensors and streams that are added live in the device.
+        unsafe {
+            let sensor = call(WHAT, |error| abi::rs2_software_device_add_sensor(device, name.as_ptr(), error))?;
+            let sensor = made(WHAT, sensor)?;
+            let profile =
+                call(WHAT, |error| abi::rs2_software_sensor_add_video_stream_ex(sensor.as_ptr(), stream, 1, error))?;
+            let size_px = [stream.width, stream.height].map(|side| u32::try_from(side).unwrap_or(0));
+            Ok(Self {
+                sensor,
+                profile: made(WHAT, profile)?,
+                format,
+                bytes_per_pixel: stream.bytes_per_pixel,
+                size_px,
+                exposure_secs_per_count,
+                n_images: 0,
+            })
+        }
+    }
+
+    /// Lets the camera see an image.
+    fn send(&mut self, file: u64, image: &Image, bytes: &[u8]) -> Result<(), Problem> {
+        self.n_images += 1;
+        let micros = image.stamp.0.div_euclid(NANOS_PER_MICRO);
+        self.tell(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_SENSOR_TIMESTAMP, micros)?;
+        self.tell(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_FRAME_COUNTER, self.n_images.into())?;
+        // The library divides by what it works out of two stamps where it is not told a rate.
+        self.tell(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_ACTUAL_FPS, 0)?;
+        if let Some(secs) = image.exposure_secs {
+            #[expect(clippy::cast_possible_truncation, reason = "the cast saturates, which is meant")]
+            let counts = (secs / self.exposure_secs_per_count).round() as i64;
+            self.tell(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_ACTUAL_EXPOSURE, counts)?;
+        }
+        let frame = VideoFrame {
+            pixels: lend(file, bytes),
+            deleter: take_back,
+            bytes_per_line: i32::try_from(self.size_px[0]).unwrap_or(0) * self.bytes_per_pixel,
+            bytes_per_pixel: self.bytes_per_pixel,
+            millis: image.stamp.0 as f64 / NANOS_PER_MILLI,
+            domain: sys::rs2_timestamp_domain_RS2_TIMESTAMP_DOMAIN_HARDWARE_CLOCK,
+            number: self.n_images,
+            profile: self.profile.as_ptr(),
+            metres_per_count: match self.format {
+                PixelFormat::DepthU16 { metres_per_count } => narrow(metres_per_count),
+                _ => 0.0,
+            },
+        };
+        // SAFETY: the sensor lives in the device; the pixels live until the library gives them back to `take_back`.
+        call("take an image", |error| unsafe {
+            abi::rs2_software_sensor_on_video_frame(self.sensor.as_ptr(), frame, error);
+        })
+    }
+
+    fn tell(&self, key: sys::rs2_frame_metadata_value, value: i64) -> Result<(), Problem> {
+        // SAFETY: the sensor lives in the device.
+        call("take metadata", |error| unsafe {
+            abi::rs2_software_sensor_set_metadata(self.sensor.as_ptr(), key, value, error);
+        })
+    }
+}
+
+/// What all streams have; format and bytes per pixel are the caller's.
+fn stream(stream: sys::rs2_stream, unique_id: i32, rate_hz: u16, intrinsics: &Intrinsics) -> VideoStream {
+    let intrinsics = lens::told(intrinsics);
+    VideoStream {
+        stream,
+        index: 0,
+        unique_id,
+        width: intrinsics.width,
+        height: intrinsics.height,
+        rate_hz: rate_hz.into(),
+        bytes_per_pixel: 0,
+        format: sys::rs2_format_RS2_FORMAT_ANY,
+        intrinsics,
+    }
+}
+
+/// Images that the library has, by address: it says only where they were when it gives them back. Beside each whose it is.
+static LENT: Mutex<BTreeMap<usize, (u64, Box<[u8]>)>> = Mutex::new(BTreeMap::new());
+/// Files begun so far.
+static N_FILES: AtomicU64 = AtomicU64::new(0);
+
+fn lent() -> MutexGuard<'static, BTreeMap<usize, (u64, Box<[u8]>)>> {
+    LENT.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn lend(file: u64, bytes: &[u8]) -> *mut c_void {
+    let mut copy: Box<[u8]> = bytes.into();
+    let pixels = copy.as_mut_ptr();
+    lent().insert(pixels.addr(), (file, copy));
+    pixels.cast()
+}
+
+extern "C" fn take_back(pixels: *mut c_void) {
+    lent().remove(&pixels.addr());
+}
+
+/// Waits until the library has at most so many images of a file.
+fn wait_until_written(
+    path: &Path,
+    file: u64,
+    most: usize,
+    meanwhile: impl Fn() -> Result<(), Problem>,
+) -> Result<(), Problem> {
+    let began = Instant::now();
+    loop {
+        meanwhile()?;
+        if lent().values().filter(|(whose, _)| *whose == file).count() <= most {
+            return Ok(());
+        }
+        if began.elapsed() > MAX_WAIT {
+            return Err(Problem::File {
+                path: path.to_owned(),
+                reason: format!("no image was written for {MAX_WAIT:?}"),
+            });
+        }
+        std::thread::sleep(LOOK);
+    }
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "the library has single precision")]
+fn narrow(number: f64) -> f32 {
+    number as f32
+}

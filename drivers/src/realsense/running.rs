@@ -1,0 +1,222 @@
+//! A RealSense camera that streams, or a file that plays: from the library's frames to stamped images.
+
+use super::filters::Filters;
+use super::find::{self, Found};
+use super::options;
+use super::sdk::{Context, Device, Frame, Queue, bytes};
+use super::stamps::{Stamps, Told};
+use super::streams::{self, Calibration, Started};
+use super::{Config, Problem};
+use crate::{Error, Image, PixelFormat, clock};
+use realsense_rust::frame::{FrameEx, ImageFrame};
+use realsense_rust::kind::{Rs2FrameMetadata, Rs2StreamKind};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// Images of all streams that may wait while we copy one: a quarter of a second of two streams at 30 Hz.
+const N_WAITING: u8 = 16;
+/// How soon the end of a file is noticed.
+const POLL: Duration = Duration::from_millis(100);
+/// A file that has given no image for this long is at its end, or holds none.
+const MAX_BEGIN: Duration = Duration::from_secs(2);
+/// Exposures of depth are told in microseconds.
+const DEPTH_SECS_PER_COUNT: f64 = 1e-6;
+
+/// A device that streams.
+#[derive(Debug)]
+pub(super) struct Running {
+    camera: Arc<str>,
+    stamps: Stamps,
+    filters: Filters,
+    counted: [Counted; 2],
+    /// Of a file: taken and not due yet.
+    early: Option<Image>,
+    image_secs_per_count: f64,
+    is_file: bool,
+    began: Instant,
+    last_image: Instant,
+    n_images: u64,
+    described: String,
+    started: Started,
+    device: Device,
+    /// After what runs into it.
+    queue: Queue,
+    /// After what it listed.
+    _context: Context,
+}
+
+/// What came of one kind of image: colour or infrared, and depth.
+#[derive(Clone, Copy, Debug, Default)]
+struct Counted {
+    last_number: Option<u64>,
+    n_untold: u64,
+}
+
+/// What one wait led to.
+pub(super) enum Next {
+    Image(Image),
+    Nothing,
+    /// The file is at its end.
+    End,
+}
+
+impl Running {
+    /// Finds the device of a config, sets it up and starts its streams.
+    pub(super) fn start(config: &Config) -> Result<Self, Problem> {
+        let context = Context::new()?;
+        let mut device = match &config.file {
+            Some(path) => context.file(path)?,
+            None => find::camera(&context, &config.serial)?,
+        };
+        let found = Found::of(&device);
+        let queue = Queue::new(N_WAITING)?;
+        let started = streams::start(config, &device, &queue)?;
+        let mut described = format!("{}, {}", found.describe(), started.described);
+        if config.file.is_none() {
+            warn_of(&config.name, &found);
+            let told = options::apply(&config.settings, &mut device, started.image_sensor);
+            let told = told.inspect_err(|_| started.stop(&device))?;
+            described = format!("{described}; set and read back: {}", told.join(", "));
+        }
+        let micros_per_count = options::exposure_micros_per_count(&device.sensors[started.image_sensor]);
+        Ok(Self {
+            camera: config.name.as_str().into(),
+            stamps: Stamps::new(config),
+            filters: Filters::new(&config.filters)?,
+            counted: [Counted::default(); 2],
+            early: None,
+            image_secs_per_count: micros_per_count * 1e-6,
+            is_file: config.file.is_some(),
+            began: Instant::now(),
+            last_image: Instant::now(),
+            n_images: 0,
+            described,
+            started,
+            device,
+            queue,
+            _context: context,
+        })
+    }
+
+    /// Device, modes and settings, for people.
+    pub(super) fn describe(&self) -> &str {
+        &self.described
+    }
+
+    pub(super) fn calibration(&self) -> &Calibration {
+        &self.started.calibration
+    }
+
+    /// Images given out since the start.
+    pub(super) fn n_images(&self) -> u64 {
+        self.n_images
+    }
+
+    /// Since when no image came.
+    pub(super) fn silent_for(&self) -> Duration {
+        self.last_image.elapsed()
+    }
+
+    /// The next image of any stream; an error means that the device is lost.
+    pub(super) fn next(&mut self, deadline: Instant) -> Result<Next, Problem> {
+        loop {
+            if let Some(image) = self.early.take_if(|image| self.stamps.is_due(image.stamp)) {
+                return Ok(Next::Image(self.give(image)));
+            }
+            let left = deadline.saturating_duration_since(Instant::now());
+            if let Some(image) = &self.early {
+                if left.is_zero() {
+                    return Ok(Next::Nothing);
+                }
+                let due = Duration::from_nanos(image.stamp.0.saturating_sub(clock::now().0).max(0).unsigned_abs());
+                std::thread::sleep(left.min(due));
+                continue;
+            }
+            // Asked before: what came until then is in the queue.
+            let has_stopped = self.is_file && self.device.has_stopped()?;
+            match self.queue.wait(left.min(POLL))? {
+                Some(frame) => {
+                    let image = self.image(frame)?;
+                    if image.is_none() {
+                        continue;
+                    }
+                    self.early = image;
+                }
+                None if has_stopped && (self.n_images > 0 || self.began.elapsed() > MAX_BEGIN) => return Ok(Next::End),
+                None if left <= POLL => return Ok(Next::Nothing),
+                None => {}
+            }
+        }
+    }
+
+    fn give(&mut self, image: Image) -> Image {
+        self.last_image = Instant::now();
+        self.n_images += 1;
+        image
+    }
+
+    /// Copies a frame out of the library; one that came already is none.
+    fn image(&mut self, frame: Frame) -> Result<Option<Image>, Problem> {
+        let arrival = clock::now();
+        let is_depth = frame.stream_profile().kind() == Rs2StreamKind::Depth;
+        let counted = &mut self.counted[usize::from(is_depth)];
+        let number = frame.frame_number();
+        match counted.last_number.replace(number) {
+            // The library gives the last image of a stream again in some cases.
+            Some(last) if last == number => return Ok(None),
+            Some(last) if number > last => counted.n_untold += number - last - 1,
+            _ => {}
+        }
+        let (format, secs_per_count) = match (is_depth, &self.started.calibration.depth) {
+            (true, Some(depth)) => {
+                (PixelFormat::DepthU16 { metres_per_count: depth.metres_per_count }, DEPTH_SECS_PER_COUNT)
+            }
+            (true, None) => return Ok(None),
+            (false, _) => (self.started.format, self.image_secs_per_count),
+        };
+        let told = Told::of(&frame);
+        #[expect(clippy::cast_precision_loss, reason = "an exposure lasts less than a day")]
+        let exposure_secs =
+            frame.metadata(Rs2FrameMetadata::ActualExposure).map(|counts| counts as f64 * secs_per_count);
+        let image = Image {
+            camera: Arc::clone(&self.camera),
+            stamp: self.stamps.stamp(&told, arrival),
+            size_px: [0; 2],
+            format,
+            data: Arc::new([]),
+            exposure_secs,
+            n_skipped: std::mem::take(&mut counted.n_untold),
+        };
+        let image = if is_depth && !self.filters.are_none() {
+            filled(image, &self.filters.pass(frame)?)
+        } else {
+            filled(image, &frame)
+        };
+        image.map(Some).map_err(|error| Problem::Library { what: "give a whole image", reason: error.to_string() })
+    }
+}
+
+/// An image with the bytes of a frame.
+fn filled<Kind>(image: Image, frame: &ImageFrame<Kind>) -> Result<Image, Error> {
+    let side = |pixels: usize| u32::try_from(pixels).unwrap_or(u32::MAX);
+    let size_px = [side(frame.width()), side(frame.height())];
+    Image { size_px, data: bytes(frame).into(), ..image }.pack_rows(frame.stride())
+}
+
+fn warn_of(camera: &str, found: &Found) {
+    if found.is_on_usb2() {
+        log::warn!(
+            "camera {camera:?}: it runs at USB 2, which carries few of its modes: use a USB 3 port and the cable that came with it"
+        );
+    }
+    if found.has_old_firmware() {
+        let wanted = found.recommended_firmware.as_deref().unwrap_or_default();
+        log::warn!("camera {camera:?}: its firmware {} is older than the library wants ({wanted})", found.firmware);
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        self.started.stop(&self.device);
+    }
+}

@@ -1,0 +1,187 @@
+//! When an image of a RealSense camera was taken, on our clock.
+//!
+//! With its metadata (a patched kernel module, or the library's own USB backend) a camera tells the middle of the exposure on its
+//! own clock, a count of microseconds with 32 bits; the library's conversion to "global time" is switched off, for ours bears
+//! late arrivals. Without metadata there is only the arrival.
+
+use super::{Config, Pace};
+use crate::clock;
+use kinematics::clock::WrappingMicros;
+use kinematics::{ClockMap, Stamp};
+use realsense_rust::frame::FrameEx;
+use realsense_rust::kind::{Rs2FrameMetadata, Rs2TimestampDomain};
+
+const NANOS_PER_MILLI: f64 = 1e6;
+
+/// What the library says of one frame's time.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Told {
+    /// Mid-exposure by the camera's clock, microseconds.
+    pub(super) mid_exposure_micros: Option<i64>,
+    /// The library's own stamp, milliseconds.
+    pub(super) millis: f64,
+    /// Whether that is of the camera's clock, too.
+    pub(super) is_device_clock: bool,
+}
+
+impl Told {
+    pub(super) fn of(frame: &impl FrameEx) -> Self {
+        Self {
+            mid_exposure_micros: frame.metadata(Rs2FrameMetadata::SensorTimestamp),
+            millis: frame.timestamp(),
+            is_device_clock: frame.timestamp_domain() == Rs2TimestampDomain::HardwareClock,
+        }
+    }
+}
+
+/// Makes stamps of what the library tells, for all streams of one camera: they are on one clock.
+#[derive(Debug)]
+pub(super) struct Stamps {
+    camera: String,
+    /// Set for a file.
+    pace: Option<Pace>,
+    micros: WrappingMicros,
+    map: ClockMap,
+    /// First time of a file, nanoseconds of the file, and when it came.
+    first: Option<(i64, Stamp)>,
+    warned: bool,
+}
+
+impl Stamps {
+    pub(super) fn new(config: &Config) -> Self {
+        Self {
+            camera: config.name.clone(),
+            pace: config.file.is_some().then_some(config.pace),
+            micros: WrappingMicros::new(),
+            map: ClockMap::new(),
+            first: None,
+            warned: false,
+        }
+    }
+
+    /// The stamp of an image that came just now.
+    pub(super) fn stamp(&mut self, told: &Told, arrival: Stamp) -> Stamp {
+        let device_nanos = self.device_nanos(told);
+        let Some(pace) = self.pace else {
+            return device_nanos.map_or(arrival, |nanos| self.map.stamp(nanos, arrival));
+        };
+        // A file without a camera's clock has at least the library's stamps in order.
+        let nanos = device_nanos.unwrap_or_else(|| nanos_of(told.millis));
+        match pace {
+            Pace::Fast | Pace::Clock => Stamp(nanos),
+            Pace::RealTime => {
+                let (first_nanos, began) = *self.first.get_or_insert((nanos, arrival));
+                Stamp(began.0.saturating_add(nanos.saturating_sub(first_nanos)))
+            }
+        }
+    }
+
+    /// When an image is to be given out.
+    pub(super) fn is_due(&self, stamp: Stamp) -> bool {
+        matches!(self.pace, None | Some(Pace::Fast)) || stamp <= clock::now()
+    }
+
+    /// Time of the camera's clock, nanoseconds since it began; `None`, told once, where it does not tell.
+    fn device_nanos(&mut self, told: &Told) -> Option<i64> {
+        if let Some(micros) = told.mid_exposure_micros {
+            // A simulated camera has wider counts, which do not start again.
+            let is_wide = micros > i64::from(u32::MAX);
+            return Some(if is_wide { micros.saturating_mul(1000) } else { self.micros.nanos(low_bits(micros)) });
+        }
+        let warned = std::mem::replace(&mut self.warned, true);
+        let camera = &self.camera;
+        if told.is_device_clock {
+            if !warned {
+                log::warn!("camera {camera:?}: it does not tell mid-exposure: stamps are those of the readout's begin");
+            }
+            return Some(nanos_of(told.millis));
+        }
+        if !warned {
+            log::warn!(
+                "camera {camera:?}: its images come without metadata (the kernel's uvcvideo is not patched; the SDK's scripts \
+                 do it, or its RSUSB backend): they are stamped as they arrive"
+            );
+        }
+        None
+    }
+}
+
+/// Counts start again with each 2^32.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the low 32 bits are the count")]
+fn low_bits(micros: i64) -> u32 {
+    micros as u32
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "the cast saturates, which is meant")]
+fn nanos_of(millis: f64) -> i64 {
+    (millis * NANOS_PER_MILLI).round() as i64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn stamps(pace: Option<Pace>) -> Stamps {
+        Stamps {
+            camera: "wrist".into(),
+            pace,
+            micros: WrappingMicros::new(),
+            map: ClockMap::new(),
+            first: None,
+            warned: false,
+        }
+    }
+
+    fn told(micros: i64) -> Told {
+        Told { mid_exposure_micros: Some(micros), millis: 0.0, is_device_clock: true }
+    }
+
+    #[test]
+    fn a_cameras_clock_is_mapped_to_ours_across_its_wrap() {
+        let mut stamps = stamps(None);
+        let begin = i64::from(u32::MAX) - 500_000;
+        for image in 0..100_i64 {
+            let since_micros = image * 33_333;
+            // Negative where the middle of an exposure lies before the wrap and the readout behind it.
+            let wrapped = (begin + since_micros) % (1 << 32);
+            let micros = if wrapped < 20_000 { wrapped - (1 << 32) } else { wrapped };
+            let late_nanos = 5_000_000 + (image % 7) * 3_000_000;
+            let arrival = Stamp(since_micros * 1000 + late_nanos);
+            let off_nanos = stamps.stamp(&told(micros), arrival).0 - since_micros * 1000;
+            // The least latency cannot be seen; jitter must not be.
+            assert!((off_nanos - 5_000_000).abs() < 200_000, "image {image}: {off_nanos}");
+        }
+    }
+
+    #[test]
+    fn a_file_keeps_its_own_stamps_or_begins_when_it_is_played() {
+        let later = 123_456;
+        for (pace, wanted) in [
+            (Pace::Fast, [7_000_000_000, 7_123_456_000]),
+            (Pace::Clock, [7_000_000_000, 7_123_456_000]),
+            (Pace::RealTime, [99, 99 + 123_456_000]),
+        ] {
+            let mut stamps = stamps(Some(pace));
+            let got = [(0, 99), (later, 5_000)]
+                .map(|(since, arrival)| stamps.stamp(&told(7_000_000 + since), Stamp(arrival)).0);
+            assert_eq!(got, wanted, "{pace:?}");
+            assert_eq!(stamps.is_due(Stamp(i64::MAX)), pace == Pace::Fast);
+        }
+        // Counts of a simulated camera go on.
+        let mut wide = stamps(Some(Pace::Fast));
+        let edge = i64::from(u32::MAX);
+        let got = [edge - 1, edge + 1, edge + 3].map(|micros| wide.stamp(&told(micros), Stamp(0)).0 / 1000);
+        assert_eq!(got, [edge - 1, edge + 1, edge + 3]);
+    }
+
+    #[test]
+    fn without_metadata_the_librarys_stamp_or_the_arrival_counts() {
+        let plain = |is_device_clock| Told { mid_exposure_micros: None, millis: 12.5, is_device_clock };
+        assert_eq!(stamps(None).stamp(&plain(false), Stamp(77)), Stamp(77));
+        let mut live = stamps(None);
+        live.stamp(&plain(true), Stamp(1_000));
+        let later = Told { millis: 22.5, ..plain(true) };
+        assert_eq!(live.stamp(&later, Stamp(90_000_000)), Stamp(10_001_000));
+        assert_eq!(stamps(Some(Pace::Fast)).stamp(&plain(false), Stamp(77)), Stamp(12_500_000));
+    }
+}

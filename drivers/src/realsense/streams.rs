@@ -1,0 +1,195 @@
+//! Which streams of a camera are opened for a rig file, and what the camera knows about them.
+
+use super::sdk::{Device, Mode, Modes, Queue};
+use super::{Config, Problem, Stream, lens};
+use crate::{PixelFormat, YuvColors, YuvLayout, YuvMatrix, YuvRange};
+use kinematics::{Intrinsics, Transform};
+use realsense_rust::kind::Rs2Option;
+use realsense_sys as sys;
+use std::collections::BTreeSet;
+
+/// Y'CbCr as librealsense2 itself takes it (`src/proc/color-formats-converter.cpp`): BT.601, limited range.
+const YUV_COLORS: YuvColors = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited };
+/// Formats of images, the best first: what the camera itself sends before what the library makes of it.
+const FORMATS: [(sys::rs2_format, &str, PixelFormat); 5] = [
+    (sys::rs2_format_RS2_FORMAT_YUYV, "yuyv", PixelFormat::Yuv { layout: YuvLayout::Yuyv, colors: YUV_COLORS }),
+    (sys::rs2_format_RS2_FORMAT_UYVY, "uyvy", PixelFormat::Yuv { layout: YuvLayout::Uyvy, colors: YUV_COLORS }),
+    (sys::rs2_format_RS2_FORMAT_RGB8, "rgb", PixelFormat::Rgb8),
+    (sys::rs2_format_RS2_FORMAT_BGR8, "bgr", PixelFormat::Bgr8),
+    (sys::rs2_format_RS2_FORMAT_Y8, "grey", PixelFormat::Gray8),
+];
+/// The left one of two.
+const LEFT: i32 = 1;
+
+/// What a camera knows about itself.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Calibration {
+    /// Lens of the images that are not depth.
+    pub intrinsics: Intrinsics,
+    /// Of depth, where it is taken.
+    pub depth: Option<DepthCalibration>,
+}
+
+/// What a camera knows about its depth images.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DepthCalibration {
+    /// Its lens.
+    pub intrinsics: Intrinsics,
+    /// Pose of the depth camera in the frame of the other images.
+    pub camera_from_depth: Transform,
+    /// Metres per count.
+    pub metres_per_count: f64,
+}
+
+/// Streams that run; [`Started::stop`] ends them.
+#[derive(Debug)]
+pub(super) struct Started {
+    pub(super) calibration: Calibration,
+    /// How the bytes of images are to be read.
+    pub(super) format: PixelFormat,
+    /// Sensor of the images that are not depth.
+    pub(super) image_sensor: usize,
+    /// Sensors that run.
+    sensors: BTreeSet<usize>,
+    /// Modes, for people.
+    pub(super) described: String,
+    /// The modes that run point into these.
+    _modes: Vec<Modes>,
+}
+
+/// One stream wanted.
+struct Wanted {
+    name: &'static str,
+    stream: sys::rs2_stream,
+    size_px: [u32; 2],
+    /// Formats by number, the best first.
+    formats: Vec<sys::rs2_format>,
+}
+
+impl Wanted {
+    fn fits(&self, mode: &Mode, rate_hz: Option<f64>) -> bool {
+        mode.size_px == self.size_px
+            && rate_hz.is_none_or(|rate_hz| (f64::from(mode.rate_hz) - rate_hz).abs() < 0.5)
+            && self.formats.contains(&mode.format)
+            && self.is_of(mode)
+    }
+
+    /// Whether a mode is of this stream; of two infrared cameras the left one is meant, where depth is seen from.
+    fn is_of(&self, mode: &Mode) -> bool {
+        let is_infrared = mode.stream == sys::rs2_stream_RS2_STREAM_INFRARED;
+        mode.stream == self.stream && (!is_infrared || mode.index <= LEFT)
+    }
+
+    /// The best mode among all sensors: which sensor, which of its modes.
+    fn choose(&self, config: &Config, modes: &[Modes]) -> Result<(usize, usize), Problem> {
+        // A file holds what was recorded; at which rate, its stamps tell.
+        let rate_hz = config.file.is_none().then_some(config.rate_hz);
+        let all = || {
+            let of_sensor = |(sensor, modes): (usize, &'_ Modes)| {
+                (0..modes.modes.len()).map(move |mode| (sensor, mode)).collect::<Vec<_>>()
+            };
+            modes.iter().enumerate().flat_map(of_sensor)
+        };
+        let mode_at = |(sensor, mode): (usize, usize)| &modes[sensor].modes[mode];
+        let rank = |place: &(usize, usize)| self.formats.iter().position(|format| *format == mode_at(*place).format);
+        all().filter(|place| self.fits(mode_at(*place), rate_hz)).min_by_key(rank).ok_or_else(|| {
+            let offered: BTreeSet<String> =
+                all().map(mode_at).filter(|mode| self.is_of(mode)).map(|mode| describe(mode)).collect();
+            let offered: Vec<_> = offered.into_iter().collect();
+            let [width, height] = self.size_px;
+            let rate = rate_hz.map_or(String::new(), |rate_hz| format!(" at {rate_hz} Hz"));
+            Problem::NoMode {
+                wanted: format!("{} {width}x{height}{rate}", self.name),
+                offered: if offered.is_empty() { format!("no {}", self.name) } else { offered.join(", ") },
+            }
+        })
+    }
+}
+
+/// Opens the streams of a rig file into a queue.
+pub(super) fn start(config: &Config, device: &Device, queue: &Queue) -> Result<Started, Problem> {
+    let modes: Vec<Modes> = device.sensors.iter().map(|sensor| sensor.modes()).collect::<Result<_, _>>()?;
+    let (name, stream) = match config.stream {
+        Stream::Color => ("color", sys::rs2_stream_RS2_STREAM_COLOR),
+        Stream::Infrared => ("infrared", sys::rs2_stream_RS2_STREAM_INFRARED),
+    };
+    let formats = FORMATS.map(|(format, ..)| format).to_vec();
+    let image = Wanted { name, stream, size_px: config.size_px, formats }.choose(config, &modes)?;
+    let depth = config.depth_size_px.map(|size_px| {
+        let (stream, format) = (sys::rs2_stream_RS2_STREAM_DEPTH, sys::rs2_format_RS2_FORMAT_Z16);
+        Wanted { name: "depth", stream, size_px, formats: vec![format] }.choose(config, &modes)
+    });
+    let depth = depth.transpose()?;
+    let mode_at = |(sensor, mode): (usize, usize)| &modes[sensor].modes[mode];
+    let calibration = Calibration {
+        intrinsics: lens::intrinsics(&mode_at(image).intrinsics()?, name)?,
+        depth: depth.map(|depth| depth_calibration(device, depth, mode_at(depth), mode_at(image))).transpose()?,
+    };
+    let places: Vec<_> = std::iter::once(image).chain(depth).collect();
+    let described: Vec<_> = places.iter().map(|place| describe(mode_at(*place))).collect();
+    let started = Started {
+        calibration,
+        format: FORMATS
+            .iter()
+            .find(|(format, ..)| *format == mode_at(image).format)
+            .expect("one of these was chosen")
+            .2,
+        image_sensor: image.0,
+        sensors: places.iter().map(|(sensor, _)| *sensor).collect(),
+        described: described.join(" and "),
+        _modes: Vec::new(),
+    };
+    for sensor in &started.sensors {
+        let its: Vec<_> = places.iter().filter(|place| place.0 == *sensor).map(|place| mode_at(*place)).collect();
+        device.sensors[*sensor].open(&its).inspect_err(|_| started.stop(device))?;
+    }
+    started.run(device, queue, config.file.is_some()).inspect_err(|_| started.stop(device))?;
+    Ok(Started { _modes: modes, ..started })
+}
+
+impl Started {
+    /// Lets all that is open run. A file gives what comes first to those that run first, so it is held until all do.
+    fn run(&self, device: &Device, queue: &Queue, is_file: bool) -> Result<(), Problem> {
+        if is_file {
+            device.hold(true)?;
+        }
+        self.sensors.iter().try_for_each(|sensor| device.sensors[*sensor].start(queue))?;
+        if is_file {
+            device.hold(false)?;
+        }
+        Ok(())
+    }
+
+    /// Ends the streams of the device that they were started on.
+    pub(super) fn stop(&self, device: &Device) {
+        self.sensors.iter().for_each(|sensor| device.sensors[*sensor].stop());
+    }
+}
+
+fn depth_calibration(
+    device: &Device,
+    (sensor, _): (usize, usize),
+    depth: &Mode,
+    image: &Mode,
+) -> Result<DepthCalibration, Problem> {
+    let refused = |reason: String| Problem::Library { what: "tell how depth and images lie", reason };
+    let extrinsics = depth.profile()?.extrinsics(&image.profile()?).map_err(|error| refused(error.to_string()))?;
+    let scale = device.sensors[sensor].options.get_option(Rs2Option::DepthUnits);
+    let scale = scale.ok_or_else(|| refused("it tells no depth units".into()))?;
+    // Single precision means the shortest decimal that it stands for: 0.001, not 0.001000000047.
+    let metres_per_count = scale.to_string().parse().map_err(|_| refused("its depth units are no number".into()))?;
+    Ok(DepthCalibration {
+        intrinsics: lens::intrinsics(&depth.intrinsics()?, "depth")?,
+        camera_from_depth: lens::transform(&extrinsics.0),
+        metres_per_count,
+    })
+}
+
+fn describe(mode: &Mode) -> String {
+    let [width, height] = mode.size_px;
+    let format = match mode.format {
+        sys::rs2_format_RS2_FORMAT_Z16 => "z16",
+        other => FORMATS.iter().find(|(format, ..)| *format == other).map_or("another format", |(_, name, _)| name),
+    };
+    format!("{format} {width}x{height} at {} Hz", mode.rate_hz)
+}
