@@ -1,7 +1,16 @@
-//! Tells the linker where the MuJoCo library lies, for binaries and tests of the `sim` feature.
+//! Tells the linker where the MuJoCo and RealSense libraries lie, for binaries and tests of the features `sim` and `realsense`.
 
 fn main() {
     println!("cargo::rerun-if-env-changed=MUJOCO_DYNAMIC_LINK_DIR");
+    if std::env::var_os("CARGO_FEATURE_REALSENSE").is_some() {
+        // Where `scripts/fetch-realsense.sh` puts the library; an installed one is found without.
+        for folder in ["$ORIGIN", "$ORIGIN/../../.deps/realsense", "$ORIGIN/../../../.deps/realsense"] {
+            println!("cargo::rustc-link-arg=-Wl,-rpath,{folder}");
+        }
+        if let Ok(folder) = std::env::var("PKG_CONFIG_PATH") {
+            println!("cargo::rustc-link-arg=-Wl,-rpath,{folder}");
+        }
+    }
     if std::env::var_os("CARGO_FEATURE_SIM").is_none() {
         return;
     }

@@ -7,6 +7,7 @@ use serde::Serialize;
 use std::path::Path;
 
 /// Intel's USB vendor number; RealSense cameras carry it.
+#[cfg(any(not(feature = "realsense"), test))]
 const INTEL_USB_VENDOR: &str = "8086";
 
 /// Flags of `devices`.
@@ -99,18 +100,43 @@ fn video_devices(cameras: Vec<Result<v4l2::Found, v4l2::Problem>>) -> Vec<Found>
     cameras.into_iter().map(|camera| camera.map_or_else(refused, describe)).collect()
 }
 
-/// RealSense cameras on USB.
-fn realsense_cameras(sys: &Path) -> Vec<Found> {
+/// RealSense cameras by their maker's library.
+#[cfg(feature = "realsense")]
+fn realsense_cameras(_sys: &Path) -> Vec<Found> {
+    let found = |address, name, usable, note| Found { kind: "camera", address, name, usable, note };
+    match drivers::realsense::cameras() {
+        Ok(cameras) => cameras
+            .into_iter()
+            .map(|camera| {
+                let usb = camera.usb.as_ref().map_or(String::new(), |usb| format!(", USB {usb}"));
+                let note = format!("driver realsense, firmware {}{usb}", camera.firmware);
+                found(camera.serial, camera.name, true, note)
+            })
+            .collect(),
+        Err(problem) => vec![found("unknown".into(), "RealSense".into(), false, problem.to_string())],
+    }
+}
+
+/// RealSense cameras on USB, as the kernel tells.
+#[cfg(any(not(feature = "realsense"), test))]
+fn realsense_on_usb(sys: &Path) -> Vec<Found> {
     let usb = sys.join("bus/usb/devices");
     children(&usb)
         .into_iter()
         .filter(|device| attribute(&usb.join(device).join("idVendor")).as_deref() == Some(INTEL_USB_VENDOR))
         .filter_map(|device| {
             let name = attribute(&usb.join(&device).join("product")).filter(|name| name.contains("RealSense"))?;
-            let note = "RealSense cameras have no driver in this version".into();
+            let note =
+                "also driver realsense, in a program that was built with `cargo build --release --features realsense`"
+                    .into();
             Some(Found { kind: "camera", address: format!("usb {device}"), name, usable: false, note })
         })
         .collect()
+}
+
+#[cfg(not(feature = "realsense"))]
+fn realsense_cameras(sys: &Path) -> Vec<Found> {
+    realsense_on_usb(sys)
 }
 
 /// CAN interfaces, real and virtual.
@@ -128,6 +154,7 @@ fn can_interfaces(sys: &Path) -> Vec<Found> {
 }
 
 /// Names in a folder of sysfs, sorted; none where it is absent.
+#[cfg(any(not(feature = "realsense"), test))]
 fn children(folder: &Path) -> Vec<String> {
     let mut names: Vec<String> = std::fs::read_dir(folder)
         .into_iter()
@@ -166,7 +193,7 @@ mod tests {
         let can = can_interfaces(sys.path());
         assert_eq!(can.len(), 1);
         assert_eq!((can[0].address.as_str(), can[0].name.as_str()), ("can0", "CAN interface, up"));
-        let realsense = realsense_cameras(sys.path());
+        let realsense = realsense_on_usb(sys.path());
         assert_eq!(realsense.len(), 1);
         assert_eq!(realsense[0].address, "usb 2-1");
     }
@@ -194,7 +221,7 @@ mod tests {
     #[test]
     fn an_absent_sysfs_has_no_devices() {
         let sys = tempfile::tempdir().expect("folder");
-        assert_eq!(realsense_cameras(sys.path()), []);
+        assert_eq!(realsense_on_usb(sys.path()), []);
         assert_eq!(can_interfaces(sys.path()), []);
     }
 }

@@ -3,7 +3,7 @@
 mod franka;
 mod listen;
 
-use crate::config::Rig;
+use crate::config::{Camera, CameraDriver, Rig};
 use crate::exit::Exit;
 use crate::print;
 use crate::stop::Stop;
@@ -85,6 +85,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     findings.push(realtime(Path::new("/proc")));
     findings.push(cameras(Path::new("/dev")));
     findings.extend(v4l2::cameras().into_iter().flatten().filter_map(|camera| usb(&camera)));
+    findings.extend(realsense(rig.as_ref()));
     findings.extend(can(rig.as_ref()));
     findings.extend(franka::franka(rig.as_ref()));
     findings.push(port(USUAL_ADDRESS));
@@ -286,6 +287,58 @@ fn usb(camera: &v4l2::Found) -> Option<Finding> {
     let says = format!("{name}: its port carries {carries} at most, too little for {}", beyond.join(", "));
     let mend = "choose v4l2.format = \"mjpeg\", a smaller size or a lower rate, or a USB 3 port; `lsusb -t` shows who shares one";
     Some(Finding::warn("usb", says, mend))
+}
+
+/// RealSense cameras that are plugged in, and whether those of the rig are.
+#[cfg(feature = "realsense")]
+fn realsense(rig: Option<&Rig>) -> Vec<Finding> {
+    const WHAT: &str = "realsense";
+    let found = match drivers::realsense::cameras() {
+        Ok(found) => found,
+        Err(problem) => {
+            return vec![Finding::fail(WHAT, problem.to_string(), "install the udev rules of the RealSense SDK")];
+        }
+    };
+    let mut findings = Vec::new();
+    for camera in &found {
+        let name = format!("{} {}", camera.name, camera.serial);
+        if camera.is_on_usb2() {
+            let mend = "a USB 3 port and the cable that came with it; turn the plug over once";
+            findings.push(Finding::warn(WHAT, format!("{name}: runs at USB 2, which carries few of its modes"), mend));
+        }
+        if camera.has_old_firmware() {
+            let wanted = camera.recommended_firmware.as_deref().unwrap_or_default();
+            let says = format!("{name}: firmware {} is older than the library wants ({wanted})", camera.firmware);
+            findings.push(Finding::warn(WHAT, says, "rs-fw-update of the RealSense SDK"));
+        }
+        if !camera.is_on_usb2() && !camera.has_old_firmware() {
+            findings.push(Finding::ok(WHAT, format!("{name}, firmware {}", camera.firmware)));
+        }
+    }
+    for camera in realsense_of(rig) {
+        let is_there = found.iter().any(|there| camera.device.is_empty() || there.serial == camera.device);
+        if !is_there {
+            let says = format!("camera {:?}: no RealSense camera {:?} is plugged in", camera.name, camera.device);
+            findings.push(Finding::fail(WHAT, says, "fieldrig devices lists those that there are"));
+        }
+    }
+    findings
+}
+
+#[cfg(not(feature = "realsense"))]
+fn realsense(rig: Option<&Rig>) -> Vec<Finding> {
+    let missing = realsense_of(rig).map(|camera| {
+        let says = format!("camera {:?}: this program was built without RealSense cameras", camera.name);
+        let mend = "install the RealSense SDK (librealsense2), then cargo build --release --features realsense";
+        Finding::fail("realsense", says, mend)
+    });
+    missing.collect()
+}
+
+/// RealSense cameras of a rig that are no files.
+fn realsense_of(rig: Option<&Rig>) -> impl Iterator<Item = &Camera> {
+    let cameras = rig.map_or(&[][..], |rig| &rig.cameras).iter();
+    cameras.filter(|camera| camera.driver == CameraDriver::Realsense && camera.realsense.file.as_os_str().is_empty())
 }
 
 /// How CAN interfaces are set up: those that the rig names as it wants them, the others in themselves.

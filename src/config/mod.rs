@@ -17,6 +17,7 @@ pub(crate) use write::methods;
 
 use crate::method::Kind;
 use drivers::can::{BusConfig, MotorConfig};
+use drivers::realsense::{Filter, Pace, Stream};
 use drivers::v4l2::{Delivery, V4l2Format};
 use kinematics::{Intrinsics, Transform};
 use std::net::SocketAddr;
@@ -160,6 +161,7 @@ pub(crate) struct Camera {
     pub(crate) intrinsics: Intrinsics,
     pub(crate) depth: Option<Depth>,
     pub(crate) v4l2: V4l2,
+    pub(crate) realsense: Realsense,
     pub(crate) sim: CameraSim,
 }
 
@@ -183,6 +185,34 @@ pub(crate) struct V4l2 {
     pub(crate) delivery: Delivery,
     /// How long a camera that was unplugged is looked for.
     pub(crate) reconnect_secs: f64,
+}
+
+/// How a camera with the driver `realsense` is set up, beside its exposure.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Realsense {
+    /// A recorded file that is played in the camera's place; empty where a camera is meant.
+    pub(crate) file: PathBuf,
+    pub(crate) pace: Pace,
+    pub(crate) stream: Stream,
+    /// `None` here and below leaves it to the camera.
+    pub(crate) gain: Option<i32>,
+    pub(crate) brightness: Option<i32>,
+    pub(crate) white_balance_kelvin: Option<i32>,
+    pub(crate) preset: Option<String>,
+    pub(crate) laser_power: Option<f64>,
+    pub(crate) filters: Vec<Filter>,
+    /// How long a camera that was unplugged is looked for.
+    pub(crate) reconnect_secs: f64,
+    /// What the rig file leaves to the camera until it is opened.
+    pub(crate) unknown: Unknown,
+}
+
+/// Which numbers of a camera only the camera knows yet; what stands in their place is not to be used.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Unknown {
+    pub(crate) intrinsics: bool,
+    pub(crate) depth_intrinsics: bool,
+    pub(crate) camera_from_depth: bool,
 }
 
 /// The frame that a camera is fixed to.
@@ -323,6 +353,11 @@ impl Rig {
                 source,
             })?;
             motion.odrive_endpoints = path.to_string_lossy().into_owned();
+        }
+        for camera in rig.cameras.iter_mut().filter(|camera| !camera.realsense.file.as_os_str().is_empty()) {
+            // The settled rig file lies elsewhere.
+            let file = folder.join(&camera.realsense.file);
+            camera.realsense.file = std::path::absolute(&file).unwrap_or(file);
         }
         Ok(rig)
     }

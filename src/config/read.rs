@@ -3,10 +3,11 @@
 use super::section::{Reading, Section};
 use super::{
     Arm, ArmDriver, Base, BaseDriver, Camera, CameraDriver, CameraSim, ConfigError, Depth, JoinConfig, MAX_BYTES,
-    MAX_SPLATS, Measured, Override, Parent, Rig, SEED, Scanner, ScannerDriver, ScannerSim, Sim, Train, USUAL_SEED,
-    V4l2,
+    MAX_SPLATS, Measured, Override, Parent, Realsense, Rig, SEED, Scanner, ScannerDriver, ScannerSim, Sim, Train,
+    USUAL_SEED, Unknown, V4l2,
 };
 use crate::method::Kind;
+use drivers::realsense::{Filter, Pace, Stream};
 use drivers::v4l2::{Delivery, V4l2Format};
 use kinematics::{Chain, Intrinsics, Lens, Transform};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
@@ -34,6 +35,11 @@ pub(super) const CAMERA_DRIVERS: [(&str, CameraDriver); 4] = [
     ("sim", CameraDriver::Sim),
 ];
 pub(super) const DELIVERIES: [(&str, Delivery); 2] = [("every", Delivery::Every), ("newest", Delivery::Newest)];
+pub(super) const PACES: [(&str, Pace); 3] =
+    [("real_time", Pace::RealTime), ("fast", Pace::Fast), ("clock", Pace::Clock)];
+pub(super) const STREAMS: [(&str, Stream); 2] = [("color", Stream::Color), ("infrared", Stream::Infrared)];
+pub(super) const FILTERS: [(&str, Filter); 3] =
+    [("spatial", Filter::Spatial), ("temporal", Filter::Temporal), ("hole_filling", Filter::HoleFilling)];
 pub(super) const SCANNER_DRIVERS: [(&str, ScannerDriver); 2] =
     [("udp", ScannerDriver::Udp), ("sim", ScannerDriver::Sim)];
 pub(super) const PARENTS: [(&str, Parent); 3] =
@@ -262,10 +268,16 @@ fn camera(name: &str, mut keys: Section<'_>) -> Camera {
     }
     let rectified = keys.flag("rectified").unwrap_or(false);
     let intrinsics = intrinsics(&mut keys, size_px.unwrap_or([1, 1]), rectified);
-    if intrinsics.is_none() {
+    // RealSense cameras know their own.
+    let mut unknown = Unknown { intrinsics: intrinsics.is_none(), ..Unknown::default() };
+    if unknown.intrinsics && driver != Some(CameraDriver::Realsense) {
         keys.missing("intrinsics", "focal_px, principal_px and, if the lens distorts, lens and distortion");
     }
-    let intrinsics = intrinsics.unwrap_or(UNKNOWN_LENS);
+    let intrinsics = intrinsics.unwrap_or(Intrinsics { size_px: size_px.unwrap_or([1, 1]), ..UNKNOWN_LENS });
+    let depth = keys.optional_section("depth").map(|keys| depth(keys, &intrinsics, &mut unknown));
+    if driver != Some(CameraDriver::Realsense) {
+        unknown = Unknown::default();
+    }
     let period_micros = 1e6 / rate_hz.unwrap_or(1.0);
     let camera = Camera {
         name: name.into(),
@@ -277,8 +289,9 @@ fn camera(name: &str, mut keys: Section<'_>) -> Camera {
         stamp_to_mid_exposure: keys.optional_section("stamp_to_mid_exposure_millis").map(measured),
         parent: parent.unwrap_or(Parent::Flange),
         parent_from_camera: pose(&mut keys, "parent_from_camera").unwrap_or_else(Transform::identity),
-        depth: keys.optional_section("depth").map(|keys| depth(keys, &intrinsics)),
+        depth,
         v4l2: v4l2(keys.section("v4l2")),
+        realsense: realsense(keys.section("realsense"), unknown),
         sim: camera_sim(keys.section("sim")),
         intrinsics,
     };
@@ -286,7 +299,7 @@ fn camera(name: &str, mut keys: Section<'_>) -> Camera {
     camera
 }
 
-/// Stands in until the missing key is told.
+/// Stands in until the missing key is told, or the camera tells its own.
 const UNKNOWN_LENS: Intrinsics =
     Intrinsics { size_px: [1, 1], focal_px: [1.0; 2], principal_px: [0.5; 2], lens: Lens::Pinhole, rectified: true };
 
@@ -347,20 +360,24 @@ fn measured(mut keys: Section<'_>) -> Measured {
     measured
 }
 
-fn depth(mut keys: Section<'_>, color: &Intrinsics) -> Depth {
+fn depth(mut keys: Section<'_>, color: &Intrinsics, unknown: &mut Unknown) -> Depth {
     let size_px = size_px(&mut keys).unwrap_or(color.size_px);
     let rectified = keys.flag("rectified").unwrap_or(color.rectified);
     // Depth of the size of the colour is registered to it; of another size it is taken to show the same field of view.
-    let intrinsics = intrinsics(&mut keys, size_px, rectified).unwrap_or_else(|| Intrinsics {
+    let intrinsics = intrinsics(&mut keys, size_px, rectified);
+    unknown.depth_intrinsics = intrinsics.is_none();
+    let intrinsics = intrinsics.unwrap_or_else(|| Intrinsics {
         rectified,
         ..if size_px == color.size_px { color.clone() } else { color.resized(size_px) }
     });
+    let camera_from_depth = pose(&mut keys, "camera_from_depth");
+    unknown.camera_from_depth = camera_from_depth.is_none();
     let min_m = keys.number("min_m", 0.0..=100.0).unwrap_or(0.1);
     let depth = Depth {
         device: keys.text("device").unwrap_or_default(),
         metres_per_count: keys.number("metres_per_count", 1e-6..=0.1),
         intrinsics,
-        camera_from_depth: pose(&mut keys, "camera_from_depth").unwrap_or_else(Transform::identity),
+        camera_from_depth: camera_from_depth.unwrap_or_else(Transform::identity),
         factor: keys.number("factor", 0.5..=2.0).unwrap_or(1.0),
         min_m,
         max_m: keys.number("max_m", min_m..=1000.0).unwrap_or(6.0),
@@ -369,10 +386,32 @@ fn depth(mut keys: Section<'_>, color: &Intrinsics) -> Depth {
     depth
 }
 
+/// Counts of controls are 32 bits wide; what a camera takes of them it tells when it is opened.
+const ANY: std::ops::RangeInclusive<i64> = -1_000_000..=1_000_000;
+
+fn counts(number: i64) -> i32 {
+    i32::try_from(number).expect("the range was checked")
+}
+
+fn realsense(mut keys: Section<'_>, unknown: Unknown) -> Realsense {
+    let realsense = Realsense {
+        file: keys.text("file").unwrap_or_default().into(),
+        pace: keys.choice("pace", &PACES).unwrap_or_default(),
+        stream: keys.choice("stream", &STREAMS).unwrap_or_default(),
+        gain: keys.integer("gain", ANY).map(counts),
+        brightness: keys.integer("brightness", ANY).map(counts),
+        white_balance_kelvin: keys.integer("white_balance_kelvin", 1000..=20_000).map(counts),
+        preset: keys.text("preset"),
+        laser_power: keys.number("laser_power", 0.0..=1000.0),
+        filters: keys.choices_or_none("filters", &FILTERS).unwrap_or_default(),
+        reconnect_secs: keys.number("reconnect_secs", 0.0..=86_400.0).unwrap_or(30.0),
+        unknown,
+    };
+    keys.end();
+    realsense
+}
+
 fn v4l2(mut keys: Section<'_>) -> V4l2 {
-    // Counts of controls are 32 bits wide; what a camera takes of them it tells when it is opened.
-    let counts = |number: i64| i32::try_from(number).expect("the range was checked");
-    const ANY: std::ops::RangeInclusive<i64> = -1_000_000..=1_000_000;
     let v4l2 = V4l2 {
         format: keys.choice("format", &V4l2Format::OF_COLOR),
         gain: keys.integer("gain", ANY).map(counts),

@@ -261,6 +261,19 @@ impl<'a> Section<'a> {
         Some(found)
     }
 
+    /// A list of different words out of a few, which may be empty, if the key is there.
+    pub(super) fn choices_or_none<T: Copy + PartialEq>(
+        &mut self,
+        key: &'static str,
+        choices: &[(&str, T)],
+    ) -> Option<Vec<T>> {
+        if self.table.get(key).and_then(Value::as_array).is_some_and(Vec::is_empty) {
+            self.take(key);
+            return Some(Vec::new());
+        }
+        self.choices(key, choices)
+    }
+
     /// Says that a needed key is absent, unless its value was just found wrong.
     pub(super) fn missing(&self, key: &str, meaning: &'static str) {
         let key = join(&self.path, key);

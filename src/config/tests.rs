@@ -71,7 +71,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a good value that differs from the one in force, and a value that is not allowed.
-const KEYS: [(&str, &str, &str); 141] = [
+const KEYS: [(&str, &str, &str); 151] = [
     ("arm.rate_hz", "500", "0"),
     ("arm.bus.can0.bitrate_hz", "500_000", "1"),
     ("arm.bus.can0.data_bitrate_hz", "5_000_000", "9_000_000"),
@@ -142,6 +142,16 @@ const KEYS: [(&str, &str, &str); 141] = [
     ("camera.wrist.intrinsics.lens", "'pinhole'", "'fisheye'"),
     ("camera.wrist.intrinsics.distortion", "[0, 0, 0, 0, 0.1]", "[0.1]"),
     ("camera.wrist.rectified", "true", "1"),
+    ("camera.wrist.realsense.file", "'/tmp/walk.bag'", "7"),
+    ("camera.wrist.realsense.pace", "'fast'", "'slow'"),
+    ("camera.wrist.realsense.stream", "'infrared'", "'depth'"),
+    ("camera.wrist.realsense.gain", "16", "1.5"),
+    ("camera.wrist.realsense.brightness", "-12", "'bright'"),
+    ("camera.wrist.realsense.white_balance_kelvin", "4600", "46"),
+    ("camera.wrist.realsense.preset", "'high accuracy'", "3"),
+    ("camera.wrist.realsense.laser_power", "150", "-1"),
+    ("camera.wrist.realsense.filters", "['spatial', 'temporal']", "['sharpen']"),
+    ("camera.wrist.realsense.reconnect_secs", "5", "-1"),
     ("camera.wrist.v4l2.format", "'mjpeg'", "'h264'"),
     ("camera.wrist.v4l2.gain", "12", "1.5"),
     ("camera.wrist.v4l2.brightness", "-12", "'bright'"),

@@ -1,7 +1,9 @@
 //! The settled rig file: every key of a checked rig, written so that reading it gives the same rig.
 
-use super::read::{ARM_DRIVERS, BASE_DRIVERS, CAMERA_DRIVERS, DELIVERIES, PARENTS, SCANNER_DRIVERS};
-use super::{Arm, Base, Camera, CameraSim, Depth, JoinConfig, Rig, Scanner, Sim, Train, V4l2};
+use super::read::{
+    ARM_DRIVERS, BASE_DRIVERS, CAMERA_DRIVERS, DELIVERIES, FILTERS, PACES, PARENTS, SCANNER_DRIVERS, STREAMS,
+};
+use super::{Arm, Base, Camera, CameraSim, Depth, JoinConfig, Realsense, Rig, Scanner, Sim, Train, Unknown, V4l2};
 use crate::method::Kind;
 use kinematics::{Intrinsics, Lens, Transform};
 use toml::{Table, Value};
@@ -99,6 +101,7 @@ fn camera(camera: &Camera) -> Table {
             ("source", is(measured.source.as_str())),
         ]))
     });
+    let unknown = camera.realsense.unknown;
     table([
         ("driver", name_of(&CAMERA_DRIVERS, &camera.driver)),
         ("device", is(camera.device.as_str())),
@@ -109,10 +112,11 @@ fn camera(camera: &Camera) -> Table {
         ("stamp_to_mid_exposure_millis", measured),
         ("parent", name_of(&PARENTS, &camera.parent)),
         ("parent_from_camera", pose(&camera.parent_from_camera)),
-        ("intrinsics", intrinsics(&camera.intrinsics)),
-        ("rectified", is(camera.intrinsics.rectified)),
+        ("intrinsics", intrinsics(&camera.intrinsics).filter(|_| !unknown.intrinsics)),
+        ("rectified", is(camera.intrinsics.rectified && !unknown.intrinsics)),
         ("v4l2", Some(Value::Table(v4l2(&camera.v4l2)))),
-        ("depth", camera.depth.as_ref().map(|depth| Value::Table(self::depth(depth)))),
+        ("realsense", Some(Value::Table(realsense(&camera.realsense)))),
+        ("depth", camera.depth.as_ref().map(|depth| Value::Table(self::depth(depth, unknown)))),
         ("sim", Some(Value::Table(camera_sim(&camera.sim)))),
     ])
 }
@@ -128,14 +132,31 @@ fn v4l2(v4l2: &V4l2) -> Table {
     ])
 }
 
-fn depth(depth: &Depth) -> Table {
+fn realsense(realsense: &Realsense) -> Table {
+    let filters: Vec<Value> = realsense.filters.iter().filter_map(|filter| name_of(&FILTERS, filter)).collect();
+    table([
+        ("file", is(realsense.file.to_string_lossy().into_owned())),
+        ("pace", name_of(&PACES, &realsense.pace)),
+        ("stream", name_of(&STREAMS, &realsense.stream)),
+        ("gain", realsense.gain.map(Value::from)),
+        ("brightness", realsense.brightness.map(Value::from)),
+        ("white_balance_kelvin", realsense.white_balance_kelvin.map(Value::from)),
+        ("preset", realsense.preset.as_deref().map(Value::from)),
+        ("laser_power", realsense.laser_power.map(Value::from)),
+        ("filters", is(filters)),
+        ("reconnect_secs", is(realsense.reconnect_secs)),
+    ])
+}
+
+/// What only the camera knows is left out.
+fn depth(depth: &Depth, unknown: Unknown) -> Table {
     table([
         ("device", is(depth.device.as_str())),
         ("metres_per_count", depth.metres_per_count.map(Value::from)),
         ("size_px", size_px(depth.intrinsics.size_px)),
-        ("intrinsics", intrinsics(&depth.intrinsics)),
+        ("intrinsics", intrinsics(&depth.intrinsics).filter(|_| !unknown.depth_intrinsics)),
         ("rectified", is(depth.intrinsics.rectified)),
-        ("camera_from_depth", pose(&depth.camera_from_depth)),
+        ("camera_from_depth", pose(&depth.camera_from_depth).filter(|_| !unknown.camera_from_depth)),
         ("factor", is(depth.factor)),
         ("min_m", is(depth.min_m)),
         ("max_m", is(depth.max_m)),

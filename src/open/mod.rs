@@ -1,6 +1,7 @@
 //! Opens what a rig file or a recording names, as one source of samples.
 
 mod real;
+mod realsense;
 #[cfg(feature = "sim")]
 mod simulated;
 #[cfg(all(test, feature = "sim"))]
@@ -56,7 +57,10 @@ pub(crate) fn rig(mut rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
         bail!("{device} cannot be opened by this version; {WAY_OUT}");
     }
     check_arm(&rig)?;
-    let real = real::open(&rig).map_err(|error| anyhow!("{error:#}; {WAY_OUT}"))?;
+    if devices == Devices::Sim {
+        check_lenses(&rig)?;
+    }
+    let real = real::open(&mut rig).map_err(|error| anyhow!("{error:#}; {WAY_OUT}"))?;
     let source = if is_any_simulated(&rig) { simulate(&rig, real)? } else { Box::new(Live::new(real)?) };
     Ok(Opened { rig, source, damage: Arc::default() })
 }
@@ -77,6 +81,7 @@ pub(crate) fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -
         }
         rig.arm.joints = recorded.to_vec();
     }
+    check_lenses(&rig)?;
     let damage = Arc::default();
     let source = Box::new(Replay { recording, damage: Arc::clone(&damage) });
     Ok(Opened { rig, source, damage })
@@ -120,6 +125,17 @@ fn check_arm(rig: &Rig) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// What only a camera knows about its lens is not known without the camera.
+fn check_lenses(rig: &Rig) -> anyhow::Result<()> {
+    if let Some(camera) = rig.cameras.iter().find(|camera| camera.realsense.unknown.intrinsics) {
+        bail!(
+            "camera.{}.intrinsics is missing: only the camera knows it, and the camera is not asked here",
+            camera.name
+        );
+    }
+    Ok(())
+}
+
 /// Whether anything of a rig is simulated.
 fn is_any_simulated(rig: &Rig) -> bool {
     rig.arm.driver == ArmDriver::Sim
@@ -133,7 +149,7 @@ fn absent_device(rig: &Rig) -> Option<String> {
     if matches!(rig.base.driver, BaseDriver::Tags | BaseDriver::Rgbd) {
         return Some(format!("base driver {:?}", format!("{:?}", rig.base.driver).to_lowercase()));
     }
-    let has_none = |camera: &&Camera| matches!(camera.driver, CameraDriver::Realsense | CameraDriver::Nokhwa);
+    let has_none = |camera: &&Camera| camera.driver == CameraDriver::Nokhwa;
     let camera = rig.cameras.iter().find(has_none)?;
     Some(format!("camera {:?} with driver {:?}", camera.name, format!("{:?}", camera.driver).to_lowercase()))
 }
@@ -189,7 +205,7 @@ mod tests {
     #[test]
     fn devices_without_a_driver_are_named_together_with_the_way_out() {
         for (key, value, named) in
-            [("base.driver", "tags", "tags"), ("camera.wrist.driver", "realsense", "camera \"wrist\"")]
+            [("base.driver", "tags", "tags"), ("camera.wrist.driver", "nokhwa", "camera \"wrist\"")]
         {
             let rig = load("static-arm.toml", &[Override::new(key, value)]);
             let message = format!("{:#}", super::rig(rig, Devices::Real).err().expect("no such driver"));
@@ -221,6 +237,20 @@ mod tests {
         let without_scale = [&standing[..3], &standing[5..]].concat();
         let message = refused(&without_scale);
         assert!(message.contains("camera.wrist.depth.device"), "{message}");
+    }
+
+    #[test]
+    fn a_realsense_camera_that_is_not_there_is_an_error_that_says_what_to_do() {
+        let overrides = [
+            Override::new("arm.driver", "none"),
+            Override::new("camera.wrist.parent", "base"),
+            Override::new("camera.wrist.driver", "realsense"),
+            Override::new("camera.wrist.device", "no such serial"),
+        ];
+        let opened = super::rig(load("static-arm.toml", &overrides), Devices::Real);
+        let message = format!("{:#}", opened.err().expect("nothing is plugged in"));
+        let wanted = if cfg!(feature = "realsense") { "\"no such serial\"" } else { "--features realsense" };
+        assert!(message.contains(wanted) && message.contains("--sim"), "{message}");
     }
 
     #[test]

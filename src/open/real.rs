@@ -17,14 +17,17 @@ use std::time::Duration;
 /// Where joint states are listened for where nothing says otherwise: of this computer only.
 const USUAL_ARM_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7011);
 
-/// Opens them; a rig may have none.
-pub(super) fn open(rig: &Rig) -> anyhow::Result<Devices> {
+/// Opens them; a rig may have none. What only a camera knew is in the rig afterwards.
+pub(super) fn open(rig: &mut Rig) -> anyhow::Result<Devices> {
     let mut devices = Devices::default();
     for camera in rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::V4l2) {
         let depth = camera.depth.as_ref().map(|depth| v4l2_depth(camera, depth)).transpose()?;
         for config in std::iter::once(v4l2_color(camera)).chain(depth) {
             devices.cameras.push(Box::new(V4l2Camera::open(config)?));
         }
+    }
+    for camera in rig.cameras.iter_mut().filter(|camera| camera.driver == CameraDriver::Realsense) {
+        devices.cameras.push(super::realsense::open(camera)?);
     }
     devices.arm = match rig.arm.driver {
         ArmDriver::None | ArmDriver::Sim => None,

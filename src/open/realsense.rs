@@ -1,0 +1,104 @@
+//! A RealSense camera of a rig file: opened, and what the rig file leaves to it filled in.
+
+use crate::config::Camera;
+
+/// Opens a camera.
+#[cfg(not(feature = "realsense"))]
+pub(super) fn open(camera: &mut Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
+    anyhow::bail!(
+        "camera {:?}: this program was built without RealSense cameras: install the RealSense SDK (librealsense2) and build it with \
+         `cargo build --release --features realsense`",
+        camera.name
+    )
+}
+
+#[cfg(feature = "realsense")]
+pub(super) use with_sdk::open;
+
+#[cfg(feature = "realsense")]
+mod with_sdk {
+    use crate::config::{Camera, Unknown};
+    use drivers::realsense::{Config, RealsenseCamera, Settings};
+    use kinematics::{Intrinsics, Lens};
+    use std::time::Duration;
+
+    /// Where the lens of a rig file sees something this much elsewhere than the camera says, one of the two is of another camera.
+    const MAX_OFF_PX: f64 = 5.0;
+
+    /// Opens a camera and takes from it what the rig file does not say; where both say something the rig file counts.
+    pub(in crate::open) fn open(camera: &mut Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
+        let open = RealsenseCamera::open(config(camera))?;
+        let known = open.calibration();
+        let Unknown { intrinsics, depth_intrinsics, camera_from_depth } = std::mem::take(&mut camera.realsense.unknown);
+        settle("intrinsics", &camera.name, intrinsics, &mut camera.intrinsics, &known.intrinsics);
+        if let (Some(depth), Some(known)) = (&mut camera.depth, &known.depth) {
+            settle("depth.intrinsics", &camera.name, depth_intrinsics, &mut depth.intrinsics, &known.intrinsics);
+            if camera_from_depth {
+                depth.camera_from_depth = known.camera_from_depth;
+            }
+        }
+        Ok(Box::new(open))
+    }
+
+    fn config(camera: &Camera) -> Config {
+        let Camera { realsense, .. } = camera;
+        Config {
+            name: camera.name.to_string(),
+            serial: camera.device.clone(),
+            file: (!realsense.file.as_os_str().is_empty()).then(|| realsense.file.clone()),
+            pace: realsense.pace,
+            stream: realsense.stream,
+            size_px: camera.intrinsics.size_px,
+            rate_hz: camera.rate_hz,
+            depth_size_px: camera.depth.as_ref().map(|depth| depth.intrinsics.size_px),
+            settings: Settings {
+                exposure_micros: camera.exposure_micros,
+                gain: realsense.gain,
+                white_balance_kelvin: realsense.white_balance_kelvin,
+                brightness: realsense.brightness,
+                preset: realsense.preset.clone(),
+                laser_power: realsense.laser_power,
+            },
+            filters: realsense.filters.clone(),
+            reconnect_for: Duration::from_secs_f64(realsense.reconnect_secs),
+        }
+    }
+
+    fn settle(key: &str, camera: &str, is_unknown: bool, rig: &mut Intrinsics, known: &Intrinsics) {
+        let line = toml_line(known);
+        if is_unknown {
+            log::info!("camera {camera:?}: {key} = {line}, by the camera itself");
+            *rig = known.clone();
+            return;
+        }
+        let off_px = difference_px(rig, known);
+        if off_px > MAX_OFF_PX {
+            log::warn!(
+                "camera {camera:?}: its rig file sees things up to {off_px:.1} px elsewhere than the camera itself, whose {key} is {line}; \
+                 leave the key out to take that"
+            );
+        }
+    }
+
+    /// How far apart two lenses see the same ray, over the image.
+    fn difference_px(rig: &Intrinsics, known: &Intrinsics) -> f64 {
+        const STEPS: u32 = 8;
+        let pixels = (0..=STEPS).flat_map(|row| (0..=STEPS).map(move |column| [column, row]));
+        let offs = pixels.filter_map(|steps| {
+            let side = |axis: usize| f64::from(rig.size_px[axis] * steps[axis]) / f64::from(STEPS);
+            let pixel = [side(0), side(1)];
+            let seen = known.project(&rig.unproject(pixel)?)?;
+            Some((seen[0] - pixel[0]).hypot(seen[1] - pixel[1]))
+        });
+        offs.fold(0.0, f64::max)
+    }
+
+    fn toml_line(intrinsics: &Intrinsics) -> String {
+        let lens = match &intrinsics.lens {
+            Lens::Pinhole => String::new(),
+            Lens::BrownConrady(k) => format!(", lens = \"brown_conrady\", distortion = {k:?}"),
+            Lens::KannalaBrandt(k) => format!(", lens = \"kannala_brandt\", distortion = {k:?}"),
+        };
+        format!("{{ focal_px = {:?}, principal_px = {:?}{lens} }}", intrinsics.focal_px, intrinsics.principal_px)
+    }
+}

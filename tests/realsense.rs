@@ -1,0 +1,90 @@
+//! A rig whose camera is a file that librealsense2 recorded: the binary reads lens and depth pose from it and records its images.
+
+use drivers::realsense::played::{BagWriter, PlayedCamera, PlayedDepth};
+use drivers::recording::{RIG_FILE, Recording};
+use drivers::{Image, PixelFormat, Sample, Source};
+use kinematics::{Intrinsics, Lens, Stamp, Transform};
+use std::path::Path;
+use std::process::Command;
+
+const N_IMAGES: i64 = 10;
+const RIG: &str = r#"
+[arm]
+driver = "none"
+
+[camera.front]
+driver = "realsense"
+size_px = [320, 240]
+rate_hz = 30
+parent = "world"
+
+[camera.front.realsense]
+file = "front.bag"
+
+[camera.front.depth]
+"#;
+
+/// A camera whose depth lies 15 mm beside its colour.
+fn write_bag(path: &Path) {
+    let lens = |focal_px| Intrinsics {
+        size_px: [320, 240],
+        focal_px: [focal_px, focal_px],
+        principal_px: [161.5, 119.25],
+        lens: Lens::Pinhole,
+        rectified: false,
+    };
+    let depth = PlayedDepth {
+        intrinsics: lens(192.5),
+        camera_from_depth: Transform::translation(0.015, 0.0, 0.0),
+        metres_per_count: 0.001,
+    };
+    let camera = PlayedCamera {
+        name: "Intel RealSense D435I".into(),
+        serial: "1".into(),
+        rate_hz: 30,
+        intrinsics: lens(303.25),
+        format: PixelFormat::Rgb8,
+        depth: Some(depth),
+    };
+    let mut writer = BagWriter::create(path, &camera).expect("a file to write");
+    for number in 0..N_IMAGES {
+        let color = Image {
+            camera: "front".into(),
+            stamp: Stamp(1_000_000_000 + number * 33_333_000),
+            size_px: [320, 240],
+            format: PixelFormat::Rgb8,
+            data: vec![number.to_le_bytes()[0]; 320 * 240 * 3].into(),
+            exposure_secs: None,
+            n_skipped: 0,
+        };
+        writer.write(&color).expect("room on the disk");
+        let format = PixelFormat::DepthU16 { metres_per_count: 0.001 };
+        writer.write(&Image { format, data: [232, 3].repeat(320 * 240).into(), ..color }).expect("room on the disk");
+    }
+    writer.finish().expect("room on the disk");
+}
+
+#[test]
+fn a_rig_with_a_recorded_camera_is_recorded_with_what_the_camera_knows() {
+    let folder = tempfile::tempdir().unwrap();
+    let [rig, out] = ["rig.toml", "out.mcap"].map(|name| folder.path().join(name));
+    write_bag(&folder.path().join("front.bag"));
+    std::fs::write(&rig, RIG).unwrap();
+    let output = Command::new(env!("CARGO_BIN_EXE_fieldrig")).arg("record").arg(&rig).arg("--out").arg(&out).output();
+    let output = output.unwrap();
+    let told = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(0), "{told}");
+    let mut recording = Recording::open(&out).unwrap();
+    let settled = String::from_utf8(recording.attachment(RIG_FILE).unwrap().to_vec()).unwrap();
+    assert!(settled.contains("303.25") && settled.contains("192.5") && settled.contains("0.015"), "{settled}");
+    let mut n_images = [0; 2];
+    while let Some(sample) = recording.next_sample().unwrap() {
+        let Sample::Image(image) = sample else { panic!("a camera gives images") };
+        match image.is_depth() {
+            true => assert!(image.decode_depth_m().unwrap().iter().all(|metres| (metres - 1.0).abs() < 1e-6)),
+            false => assert!(image.data.iter().all(|byte| *byte == image.data[0])),
+        }
+        n_images[usize::from(image.is_depth())] += 1;
+    }
+    assert_eq!(n_images, [N_IMAGES; 2], "{told}");
+}
