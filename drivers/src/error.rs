@@ -57,6 +57,14 @@ pub enum Error {
         /// Name in the rig file.
         camera: String,
     },
+    /// The next image of a file that a camera is played from is due later; asking again then gives it.
+    #[error("camera {camera:?}: the next image of its file is due in {left:?}")]
+    NotDue {
+        /// Name in the rig file.
+        camera: String,
+        /// From now on.
+        left: Duration,
+    },
     /// A camera was lost and is looked for; asking again may find it.
     #[error("camera {camera:?}: lost for {waited:?}, looking for it")]
     Reconnecting {

@@ -39,7 +39,7 @@ pub trait Camera: Send {
     /// A slow caller loses the oldest images; the loss is counted in [`Image::n_skipped`]. A camera that was unplugged and is
     /// looked for says [`Error::Reconnecting`], for a bounded time.
     ///
-    /// A camera that is played from a file says [`Error::Ended`] at the end.
+    /// A camera that is played from a file says [`Error::NotDue`] where its next image comes later, and [`Error::Ended`] at the end.
     fn next_image(&mut self, timeout: Duration) -> Result<Image, Error>;
     /// Whether it waits for a slow caller instead of losing images, as a file can that is played as fast as it is taken.
     fn waits_for_caller(&self) -> bool {

@@ -89,7 +89,7 @@ impl Live {
             live.read(format!("camera {:?}", camera.name()), room, silent, move || match camera.next_image(POLL) {
                 Err(Error::Ended { .. }) => Ok(Heard::End),
                 Err(Error::NoImage { .. }) => Ok(Heard::Nothing),
-                Err(Error::Reconnecting { .. }) => Ok(Heard::Mending),
+                Err(Error::Reconnecting { .. } | Error::NotDue { .. }) => Ok(Heard::Mending),
                 image => image.map(Sample::Image).map(Heard::Sample),
             })?;
         }
@@ -167,7 +167,7 @@ enum Heard {
     Sample(Sample),
     /// It is there and said nothing.
     Nothing,
-    /// It is lost, and its driver looks for it: how long, the driver bounds.
+    /// It is lost, and its driver looks for it: how long, the driver bounds. Or it is a file, and its next image is not due.
     Mending,
     /// It is a file, and that is at its end.
     End,

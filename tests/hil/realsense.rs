@@ -158,6 +158,7 @@ fn play(config: Config) -> (RealsenseCamera, Vec<Image>) {
     loop {
         match camera.next_image(PATIENCE) {
             Ok(image) => images.push(image),
+            Err(Error::NotDue { .. }) => {}
             Err(Error::Ended { .. }) => return (camera, images),
             Err(error) => panic!("{error}"),
         }
@@ -256,6 +257,30 @@ fn a_file_plays_in_real_time_and_a_slow_caller_of_a_fast_one_loses_nothing() {
         std::thread::sleep(Duration::from_millis(10));
     }
     assert_eq!(n_images, 2 * N_IMAGES);
+}
+
+#[test]
+fn a_file_by_the_clock_begins_when_its_stamps_say_so() {
+    const LATER_SECS: f64 = 6.0; // Longer than a device may be silent.
+    let folder = tempfile::tempdir().unwrap();
+    let camera = d435i([640, 480], Lens::Pinhole);
+    let path = folder.path().join("camera.bag");
+    // Whole microseconds.
+    let begins = Stamp(drivers::clock::now().plus_secs(LATER_SECS).0 / 1000 * 1000);
+    let mut writer = BagWriter::create(&path, &camera).unwrap();
+    for number in 0..3 {
+        let stamp = Stamp(begins.0 + number * PERIOD_NANOS);
+        writer.write(&Image { stamp, ..image(&camera, number) }).unwrap();
+    }
+    writer.finish().unwrap();
+    let open = RealsenseCamera::open(config(path, &camera, Pace::Clock)).unwrap();
+    let mut live = Live::new(Devices { cameras: vec![Box::new(open)], ..Devices::default() }).unwrap();
+    for number in 0..3 {
+        let sample = live.next_sample().unwrap().unwrap();
+        assert_eq!(sample.stamp(), Stamp(begins.0 + number * PERIOD_NANOS));
+        assert!(drivers::clock::now() >= sample.stamp(), "it came before its time");
+    }
+    assert_eq!(live.next_sample().unwrap(), None);
 }
 
 #[test]

@@ -92,6 +92,7 @@ impl RealsenseCamera {
         match running.next(deadline) {
             Ok(Next::Image(image)) => return Ok(Some(self.count(image))),
             Ok(Next::End) => return Err(Error::Ended { camera: self.config.name.clone() }),
+            Ok(Next::Later(left)) => return Err(Error::NotDue { camera: self.config.name.clone(), left }),
             Ok(Next::Nothing) => {}
             Err(problem) => return self.lose(problem).map(|()| None),
         }

@@ -56,6 +56,8 @@ struct Counted {
 pub(super) enum Next {
     Image(Image),
     Nothing,
+    /// The next image of the file is due so much later.
+    Later(Duration),
     /// The file is at its end.
     End,
 }
@@ -125,11 +127,11 @@ impl Running {
             }
             let left = deadline.saturating_duration_since(Instant::now());
             if let Some(image) = &self.early {
+                let due_in = Duration::from_nanos(image.stamp.0.saturating_sub(clock::now().0).max(0).unsigned_abs());
                 if left.is_zero() {
-                    return Ok(Next::Nothing);
+                    return Ok(Next::Later(due_in));
                 }
-                let due = Duration::from_nanos(image.stamp.0.saturating_sub(clock::now().0).max(0).unsigned_abs());
-                std::thread::sleep(left.min(due));
+                std::thread::sleep(left.min(due_in));
                 continue;
             }
             // Asked before: what came until then is in the queue.
