@@ -193,6 +193,8 @@ pub(crate) struct Realsense {
     /// A recorded file that is played in the camera's place; empty where a camera is meant.
     pub(crate) file: PathBuf,
     pub(crate) pace: Pace,
+    /// With the pace `clock`: what is added to the stamps of the file.
+    pub(crate) clock_offset_nanos: i64,
     pub(crate) stream: Stream,
     /// `None` here and below leaves it to the camera.
     pub(crate) gain: Option<i32>,

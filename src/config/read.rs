@@ -397,6 +397,7 @@ fn realsense(mut keys: Section<'_>, unknown: Unknown) -> Realsense {
     let realsense = Realsense {
         file: keys.text("file").unwrap_or_default().into(),
         pace: keys.choice("pace", &PACES).unwrap_or_default(),
+        clock_offset_nanos: keys.integer("clock_offset_nanos", -i64::MAX..=i64::MAX).unwrap_or(0),
         stream: keys.choice("stream", &STREAMS).unwrap_or_default(),
         gain: keys.integer("gain", ANY).map(counts),
         brightness: keys.integer("brightness", ANY).map(counts),

@@ -71,7 +71,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a good value that differs from the one in force, and a value that is not allowed.
-const KEYS: [(&str, &str, &str); 151] = [
+const KEYS: [(&str, &str, &str); 152] = [
     ("arm.rate_hz", "500", "0"),
     ("arm.bus.can0.bitrate_hz", "500_000", "1"),
     ("arm.bus.can0.data_bitrate_hz", "5_000_000", "9_000_000"),
@@ -144,6 +144,7 @@ const KEYS: [(&str, &str, &str); 151] = [
     ("camera.wrist.rectified", "true", "1"),
     ("camera.wrist.realsense.file", "'/tmp/walk.bag'", "7"),
     ("camera.wrist.realsense.pace", "'fast'", "'slow'"),
+    ("camera.wrist.realsense.clock_offset_nanos", "-1_234_567", "0.5"),
     ("camera.wrist.realsense.stream", "'infrared'", "'depth'"),
     ("camera.wrist.realsense.gain", "16", "1.5"),
     ("camera.wrist.realsense.brightness", "-12", "'bright'"),

@@ -137,6 +137,7 @@ fn realsense(realsense: &Realsense) -> Table {
     table([
         ("file", is(realsense.file.to_string_lossy().into_owned())),
         ("pace", name_of(&PACES, &realsense.pace)),
+        ("clock_offset_nanos", is(realsense.clock_offset_nanos)),
         ("stream", name_of(&STREAMS, &realsense.stream)),
         ("gain", realsense.gain.map(Value::from)),
         ("brightness", realsense.brightness.map(Value::from)),

@@ -47,6 +47,7 @@ mod with_sdk {
             serial: camera.device.clone(),
             file: (!realsense.file.as_os_str().is_empty()).then(|| realsense.file.clone()),
             pace: realsense.pace,
+            clock_offset_nanos: realsense.clock_offset_nanos,
             stream: realsense.stream,
             size_px: camera.intrinsics.size_px,
             rate_hz: camera.rate_hz,

@@ -141,6 +141,7 @@ fn config(path: PathBuf, camera: &PlayedCamera, pace: Pace) -> Config {
         serial: String::new(),
         file: Some(path),
         pace,
+        clock_offset_nanos: 0,
         stream: Stream::Color,
         size_px: camera.intrinsics.size_px,
         rate_hz: RATE_HZ.into(),
@@ -265,15 +266,14 @@ fn a_file_by_the_clock_begins_when_its_stamps_say_so() {
     let folder = tempfile::tempdir().unwrap();
     let camera = d435i([640, 480], Lens::Pinhole);
     let path = folder.path().join("camera.bag");
-    // Whole microseconds.
-    let begins = Stamp(drivers::clock::now().plus_secs(LATER_SECS).0 / 1000 * 1000);
+    let begins = drivers::clock::now().plus_secs(LATER_SECS);
     let mut writer = BagWriter::create(&path, &camera).unwrap();
     for number in 0..3 {
-        let stamp = Stamp(begins.0 + number * PERIOD_NANOS);
-        writer.write(&Image { stamp, ..image(&camera, number) }).unwrap();
+        writer.write(&image(&camera, number)).unwrap();
     }
     writer.finish().unwrap();
-    let open = RealsenseCamera::open(config(path, &camera, Pace::Clock)).unwrap();
+    let by_clock = config(path, &camera, Pace::Clock);
+    let open = RealsenseCamera::open(Config { clock_offset_nanos: begins.0 - BEGIN_NANOS, ..by_clock }).unwrap();
     let mut live = Live::new(Devices { cameras: vec![Box::new(open)], ..Devices::default() }).unwrap();
     for number in 0..3 {
         let sample = live.next_sample().unwrap().unwrap();

@@ -14,6 +14,8 @@ pub struct Config {
     pub file: Option<PathBuf>,
     /// When images of a file come.
     pub pace: Pace,
+    /// With [`Pace::Clock`]: what is added to the stamps of the file, nanoseconds.
+    pub clock_offset_nanos: i64,
     /// Which stream gives the images that are not depth.
     pub stream: Stream,
     /// Their width and height, pixels.
@@ -38,8 +40,8 @@ pub enum Pace {
     RealTime,
     /// As fast as they are taken, with the stamps of the file.
     Fast,
-    /// With the stamps of the file, which are of this computer's monotonic clock, and each when that time has come: for
-    /// simulations that play other devices beside the file.
+    /// With the stamps of the file and [`Config::clock_offset_nanos`], which are of this computer's monotonic clock, and each when
+    /// that time has come: for simulations that play other devices beside the file.
     Clock,
 }
 

@@ -40,6 +40,7 @@ pub(super) struct Stamps {
     camera: String,
     /// Set for a file.
     pace: Option<Pace>,
+    offset_nanos: i64,
     micros: WrappingMicros,
     map: ClockMap,
     /// First time of a file, nanoseconds of the file, and when it came.
@@ -52,6 +53,7 @@ impl Stamps {
         Self {
             camera: config.name.clone(),
             pace: config.file.is_some().then_some(config.pace),
+            offset_nanos: config.clock_offset_nanos,
             micros: WrappingMicros::new(),
             map: ClockMap::new(),
             first: None,
@@ -68,7 +70,8 @@ impl Stamps {
         // A file without a camera's clock has at least the library's stamps in order.
         let nanos = device_nanos.unwrap_or_else(|| nanos_of(told.millis));
         match pace {
-            Pace::Fast | Pace::Clock => Stamp(nanos),
+            Pace::Fast => Stamp(nanos),
+            Pace::Clock => Stamp(nanos.saturating_add(self.offset_nanos)),
             Pace::RealTime => {
                 let (first_nanos, began) = *self.first.get_or_insert((nanos, arrival));
                 Stamp(began.0.saturating_add(nanos.saturating_sub(first_nanos)))
@@ -125,6 +128,7 @@ mod tests {
         Stamps {
             camera: "wrist".into(),
             pace,
+            offset_nanos: 5,
             micros: WrappingMicros::new(),
             map: ClockMap::new(),
             first: None,
@@ -158,7 +162,7 @@ mod tests {
         let later = 123_456;
         for (pace, wanted) in [
             (Pace::Fast, [7_000_000_000, 7_123_456_000]),
-            (Pace::Clock, [7_000_000_000, 7_123_456_000]),
+            (Pace::Clock, [7_000_000_005, 7_123_456_005]),
             (Pace::RealTime, [99, 99 + 123_456_000]),
         ] {
             let mut stamps = stamps(Some(pace));
