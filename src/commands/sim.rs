@@ -52,5 +52,7 @@ pub(crate) fn run(_args: &Args) -> anyhow::Result<Exit> {
     )
 }
 
+#[cfg(all(feature = "sim", feature = "realsense", target_os = "linux"))]
+mod bag;
 #[cfg(all(feature = "sim", target_os = "linux"))]
 mod playing;

@@ -1,7 +1,7 @@
 //! From a rig file to its devices on the wire.
 
 use super::Args;
-use crate::config::{ArmDriver, BaseDriver, Rig, ScannerDriver};
+use crate::config::{ArmDriver, BaseDriver, CameraDriver, Rig, ScannerDriver};
 use crate::exit::{BadArgument, Exit};
 use crate::open::{self, Devices, Opened};
 use crate::print;
@@ -48,7 +48,7 @@ struct Ready<'a> {
 
 pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     let stop = Stop::on_ctrl_c()?;
-    let (name, rig) = load(&args.what)?;
+    let (name, mut rig) = load(&args.what)?;
     check(&rig)?;
     let folder = args.out.clone().unwrap_or_else(|| PathBuf::from(format!("sim-{name}")));
     std::fs::create_dir_all(&folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
@@ -60,16 +60,21 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
         },
     };
     let script = script(&recording, args.seconds)?;
+    let mut told = films(&mut rig, &recording, args, &folder)?;
     let first = script.joints.first().map(|state| state.stamp);
     let first = first.or(script.poses.first().map(|pose| pose.stamp)).unwrap_or_default();
     let clockwork = Clockwork { scripted: first, played: clock::now().plus_secs(args.start_in) };
+    for camera in &mut rig.cameras {
+        camera.realsense.clock_offset_nanos = clockwork.played.0.saturating_sub(clockwork.scripted.0);
+    }
     let rig_file = write_rig(&folder, &rig)?;
     let played = Played::start(&rig, &script, clockwork, args)?;
+    told.extend(played.told.iter().cloned());
     if args.json {
         let (starts_in_secs, seconds) = (args.start_in, args.seconds);
-        print::json(&Ready { event: "ready", rig: &rig_file, starts_in_secs, seconds, playing: &played.told })?;
+        print::json(&Ready { event: "ready", rig: &rig_file, starts_in_secs, seconds, playing: &told })?;
     } else {
-        for device in &played.told {
+        for device in &told {
             print::line(device)?;
         }
         print::line(format_args!(
@@ -97,8 +102,28 @@ fn load(what: &str) -> anyhow::Result<(String, Rig)> {
     Ok((name, Rig::load(path, &[])?))
 }
 
-/// Refuses a rig of which nothing is on the wire.
+/// Writes what RealSense cameras play.
+#[cfg(feature = "realsense")]
+fn films(rig: &mut Rig, recording: &Path, args: &Args, folder: &Path) -> anyhow::Result<Vec<String>> {
+    super::bag::write(rig, recording, args.seconds, folder, args.json)
+}
+
+#[cfg(not(feature = "realsense"))]
+#[expect(clippy::unnecessary_wraps, reason = "with these cameras it can fail")]
+fn films(_rig: &mut Rig, _recording: &Path, _args: &Args, _folder: &Path) -> anyhow::Result<Vec<String>> {
+    Ok(Vec::new())
+}
+
+/// Refuses a rig that cannot be played, before a minute is spent on simulating it.
 fn check(rig: &Rig) -> Result<(), BadArgument> {
+    let film = rig.cameras.iter().find(|camera| camera.driver == CameraDriver::Realsense);
+    if let (Some(camera), false) = (film, cfg!(feature = "realsense")) {
+        return Err(BadArgument(format!(
+            "camera {:?}: this program was built without RealSense cameras: install the RealSense SDK (or run \
+             scripts/fetch-realsense.sh) and build it with `cargo build --release --features sim,realsense`",
+            camera.name
+        )));
+    }
     if rig.arm.driver == ArmDriver::Sim {
         return Err(BadArgument(
             "arm.driver is sim: `fieldrig run` plays such an arm itself; on the wire are franka, can and udp"
