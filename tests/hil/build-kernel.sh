@@ -40,7 +40,7 @@ fi
 # What the kernel is made of names it.
 key=$(cat "$config" "$here/build-kernel.sh" | { cat; echo "$found"; } | sha256sum | cut -c1-16)
 kernel=$folder/linux-$1-$key
-if [ -x "$kernel" ]; then
+if [ -s "$kernel" ]; then
     echo "$kernel"
     exit 0
 fi
