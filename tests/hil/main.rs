@@ -12,6 +12,7 @@ mod can;
 mod can_motion;
 mod kvaser;
 mod qemu;
+mod wire_errors;
 
 use std::collections::BTreeSet;
 use std::fs;
