@@ -1,7 +1,7 @@
 #!/bin/sh
 # Builds a kernel of the tests, once. Prints its path as the only line on stdout.
 #   um    User-Mode Linux, an ordinary program, with cameras and virtual CAN buses: about 4 minutes on two cores
-#   x86   what QEMU boots, with the driver of real CAN cards: about 2 minutes
+#   x86   what QEMU boots, with the driver of real CAN cards: about 3 minutes
 #
 # usage: build-kernel.sh um|x86 FOLDER      the folder keeps the kernel, a cache: remove it to build anew
 #

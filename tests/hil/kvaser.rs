@@ -273,6 +273,11 @@ fn states_of_a_controller_are_told_as_they_change() {
     assert_eq!(link.state, Some(State::BusOff), "{link}");
     let complaints = link.complaints(&card.config());
     assert!(complaints.iter().any(|complaint| complaint.what.starts_with("it is off the bus")), "{complaints:?}");
+    // Once the kernel has noticed that nothing goes out, which may take it a second, it takes frames and drops them.
+    let frame = Frame::classic(Id::standard(0x100).expect("11 bits"), &[]).expect("no bytes");
+    std::thread::sleep(Duration::from_millis(1200));
+    let n_taken = (0..50).filter(|_| bus.send(&frame).expect("it is up")).count();
+    assert_eq!(n_taken, 50);
     let began = clock::now();
     let errors = errors_until(&bus, |errors| errors.n_frames > 0);
     assert_eq!(errors, WireErrors { n_frames: 1, n_restarts: 1, ..WireErrors::default() });

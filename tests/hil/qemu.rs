@@ -66,9 +66,12 @@ pub(crate) fn boot(kernel: &Path, root: &Path) -> String {
         .stdin(Stdio::piped());
     run(&mut command, |machine, line| {
         if let Some((_, asked)) = line.split_once(BEND) {
-            bend(machine.id(), asked.trim());
-            let answer = machine.stdin.as_mut().expect("piped");
-            writeln!(answer, "{BENT}").expect("the machine reads its console");
+            let answer = match bend(machine.id(), asked.trim()) {
+                Ok(()) => BENT.to_owned(),
+                Err(why) => format!("not bent: {why}"),
+            };
+            // Where the machine has ended by now, its console tells.
+            let _ = writeln!(machine.stdin.as_mut().expect("piped"), "{answer}");
         }
     })
 }
@@ -77,25 +80,25 @@ pub(crate) fn boot(kernel: &Path, root: &Path) -> String {
 ///
 /// The chip is found by its acceptance registers: the test inside has written the interface's name there. In QEMU these follow on
 /// mode, status, interrupts, enabled interrupts, messages waiting, their place, and clock divider, a byte each.
-fn bend(machine: u32, asked: &str) {
-    let mut words = asked.split(' ');
-    let mut word = || words.next().expect("three words");
-    let interface = word();
-    let [status, interrupts] = [word(), word()].map(|hex| u8::from_str_radix(hex, 16).expect("hexadecimal"));
-    let maps = fs::read_to_string(format!("/proc/{machine}/maps")).expect("our own child");
+fn bend(machine: u32, asked: &str) -> std::io::Result<()> {
+    let words: Vec<&str> = asked.split(' ').collect();
+    let &[interface, status, interrupts] = words.as_slice() else { panic!("three words, not {asked}") };
+    let [status, interrupts] = [status, interrupts].map(|hex| u8::from_str_radix(hex, 16).expect("hexadecimal"));
+    let maps = fs::read_to_string(format!("/proc/{machine}/maps"))?;
     let heap = maps.lines().find(|line| line.ends_with("[heap]")).expect("QEMU has one");
     let (from, to) = heap.split_once(' ').and_then(|(range, _)| range.split_once('-')).expect("FROM-TO");
     let [from, to] = [from, to].map(|hex| u64::from_str_radix(hex, 16).expect("hexadecimal"));
-    let memory = fs::OpenOptions::new().read(true).write(true).open(format!("/proc/{machine}/mem"));
-    let memory = memory.expect("a parent may look into its child");
+    let memory = fs::OpenOptions::new().read(true).write(true).open(format!("/proc/{machine}/mem"))?;
     let mut bytes = vec![0; usize::try_from(to - from).expect("64 bits")];
-    memory.read_exact_at(&mut bytes, from).expect("all of the heap is there");
+    memory.read_exact_at(&mut bytes, from)?;
     let acceptance = [interface.as_bytes(), &ACCEPT_ALL].concat();
+    // The highest bit of the clock divider says that the chip speaks as the driver expects: a copy elsewhere has not that before it.
     let is_chip = |at: &usize| bytes[*at..].starts_with(&acceptance) && bytes[*at - 1] & 0x80 != 0;
     let found: Vec<usize> = (7..bytes.len() - acceptance.len()).filter(is_chip).collect();
-    let &[at] = found.as_slice() else { panic!("{interface}: found {} times in QEMU's memory", found.len()) };
+    let &[at] = found.as_slice() else {
+        return Err(std::io::Error::other(format!("{interface} is {} times in QEMU's memory", found.len())));
+    };
     let (status_at, interrupts_at) = (at - 6, at - 5);
-    let status = bytes[status_at] & !STATUS_ERRORS | status;
-    let set = |at: usize, value: u8| memory.write_all_at(&[value], from + at as u64);
-    set(status_at, status).and_then(|()| set(interrupts_at, bytes[interrupts_at] | interrupts)).expect("writable");
+    memory.write_all_at(&[bytes[status_at] & !STATUS_ERRORS | status], from + status_at as u64)?;
+    memory.write_all_at(&[bytes[interrupts_at] | interrupts], from + interrupts_at as u64)
 }

@@ -122,8 +122,8 @@ impl Bus {
         Duration::from_nanos(self.busy_nanos.load(Ordering::Relaxed))
     }
 
-    /// Sends a frame; waits a moment where the interface's queue is full. False where it stayed full, as it does while the
-    /// controller is off the bus or nobody acknowledges.
+    /// Sends a frame; waits a moment where the interface's queue is full. False where it stayed full, as it does while nobody
+    /// acknowledges. True says no more than that the kernel took it: those for a controller that is off the bus it takes and drops.
     pub fn send(&self, frame: &Frame) -> Result<bool, Error> {
         let began = clock::now();
         loop {
