@@ -2,8 +2,10 @@
 //! controllers and the loss of the bus are those of real interfaces. What QEMU's chips lack is bent from outside (`qemu.rs`).
 
 use super::can::{Bench, damiao};
+use super::can_motion::{Motors, movable, wait_until_stopped};
 use super::qemu;
-use drivers::can::{ArmConfig, Arrived, Bus, BusConfig, CanArm, Link, State, WireErrors};
+use drivers::can::{ArmConfig, Arrived, Bus, BusConfig, CanArm, Link, MovableCanArm, State, WireErrors, played};
+use drivers::motion::{JointTarget, Motion, MovableArm, OnLoss};
 use drivers::wire::can::{Frame, Id};
 use drivers::{Arm, Error, clock};
 use kinematics::Stamp;
@@ -248,6 +250,36 @@ fn an_arm_whose_bus_does_not_come_back_ends_with_the_cause() {
     };
     println!("kvaser: {error}");
     assert!(error.contains("it has said nothing for 1s") && error.contains("1 time off the bus, 0 back"), "{error}");
+}
+
+#[test]
+#[ignore = "needs the machine with CAN cards"]
+fn an_arm_that_is_moved_when_its_bus_is_lost_is_switched_on_again_only_on_request() {
+    let cards = [Card::up("can0"), Card::up("can1")];
+    let configs = [damiao(1), damiao(2)];
+    let motors = Motors::new(cards[1].config(), configs.to_vec(), false);
+    let mut config = movable(cards[0].config(), &configs, OnLoss::Release);
+    // Longer than this machine stands still where the one that plays it is busy.
+    config.motion.timeout = Duration::from_secs(2);
+    let mut arm = MovableCanArm::open(&config).expect("they are switched on");
+    let monitor = cards[0].bus();
+    for side in [1.0, -1.0] {
+        arm.command(&JointTarget { position: vec![side; 2] }).expect("it is switched on");
+        cards[0].goes_off_the_bus();
+        let reason = wait_until_stopped(&arm);
+        assert!(reason.contains("can0 went off the bus"), "{reason}");
+        let errors = errors_until(&monitor, |errors| errors.n_restarts > 0);
+        assert_eq!((errors.n_bus_off, errors.n_restarts), (1, 1), "{errors:?}");
+        motors.wait_until("none obeys", |seen| seen.iter().all(|seen| seen.state == played::State::Free));
+        std::thread::sleep(Duration::from_millis(500));
+        assert_eq!(motors.states(), [played::State::Free; 2], "the bus is back");
+        let refused = arm.command(&JointTarget { position: vec![0.0; 2] }).expect_err("it was not recovered");
+        assert!(refused.to_string().contains("not recovered"), "{refused}");
+        arm.recover().expect("the motors answer again");
+        assert!(!matches!(arm.motion(), Motion::Stopped { .. }), "{:?}", arm.motion());
+        motors.wait_until("all obey", |seen| seen.iter().all(|seen| seen.state == played::State::Obeys));
+        println!("kvaser: {reason}; back, motors free; switched on again on request");
+    }
 }
 
 #[test]
