@@ -65,7 +65,7 @@ tar --extract --file "$archive" --directory "$tree" --strip-components=1
             echo "the kernel does not take CONFIG_$option=y"
             exit 1
         fi
-    done
+    done || exit 1
     make ARCH=$arch -j"$(nproc)" $target
 ) >"$log" 2>&1 </dev/null || {
     tail -n 15 "$log" >&2
