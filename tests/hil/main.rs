@@ -188,7 +188,7 @@ fn run(command: &mut Command, mut hears: impl FnMut(&mut Child, &str)) -> String
         command.stdout(Stdio::piped()).stderr(Stdio::inherit()).process_group(0).spawn().expect("it is a program");
     let group = format!("-{}", child.id());
     let mut lines = BufReader::new(child.stdout.take().expect("piped"));
-    let (done, is_done) = std::sync::mpsc::channel::<()>();
+    let (done, is_done) = std::sync::mpsc::sync_channel::<()>(0);
     let guard = std::thread::spawn(move || {
         if is_done.recv_timeout(MAX_RUN) == Err(RecvTimeoutError::Timeout) {
             // The machine's processes are one group: none of them is left.
