@@ -64,11 +64,11 @@ for group in "$@"; do
         fi
         ;;
     hil)
-        # The virtual kernel of tests/hil is built of Debian 12's source; elsewhere its tests are skipped, with a line.
+        # The virtual kernels of tests/hil are built of Debian 12's source; elsewhere its tests are skipped, with a line.
         if ! grep -q '^VERSION_CODENAME=bookworm$' /etc/os-release 2>/dev/null || [ "$(uname -m)" != x86_64 ]; then
             continue
         fi
-        need linux-source-6.1 "the kernel that plays cameras and CAN buses for the tests"
+        need linux-source-6.1 "the kernels that play cameras and CAN buses for the tests"
         need_command make make "builds it"
         need_command flex flex "builds it"
         need_command bison bison "builds it"
@@ -77,6 +77,8 @@ for group in "$@"; do
         need libelf-dev "builds it"
         need libssl-dev "builds it"
         need busybox-static "starts the tests in it"
+        need qemu-system-x86 "plays CAN cards for the tests"
+        need iproute2 "sets these up"
         need python3-venv "holds the peers of Franka arms"
         ;;
     *)

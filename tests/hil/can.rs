@@ -56,12 +56,12 @@ fn swing(joint_ix: usize, at: Stamp) -> (f64, f64) {
 }
 
 /// Where a joint rests.
-fn rest_rad(joint_ix: usize) -> f64 {
+pub(crate) fn rest_rad(joint_ix: usize) -> f64 {
     0.1234 * (joint_ix as f64 - 2.0)
 }
 
 /// Motors on a thread of their own, at rest until they swing.
-struct Bench {
+pub(crate) struct Bench {
     stop: Arc<AtomicBool>,
     swings: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
@@ -69,7 +69,7 @@ struct Bench {
 
 impl Bench {
     /// `commanded`: numbers of AK motors that another master commands.
-    fn new(bus: BusConfig, motors: Vec<MotorConfig>, commanded: Vec<u8>) -> Self {
+    pub(crate) fn new(bus: BusConfig, motors: Vec<MotorConfig>, commanded: Vec<u8>) -> Self {
         let [stop, swings] = [false; 2].map(|now| Arc::new(AtomicBool::new(now)));
         let bus = Bus::open(&bus).expect("it is up");
         let (stopping, swinging) = (Arc::clone(&stop), Arc::clone(&swings));

@@ -30,8 +30,8 @@ const UNITS: Units = Units { counts_per_turn: 65_536.0, rated_torque_nm: 10.0 };
 
 /// What was seen of a motor, in angles of its joint.
 #[derive(Clone, Debug)]
-struct Seen {
-    state: State,
+pub(crate) struct Seen {
+    pub(crate) state: State,
     position_rad: f64,
     velocity_rad_s: f64,
     lost_at: Option<Stamp>,
@@ -40,7 +40,7 @@ struct Seen {
 }
 
 /// Motors on a thread of their own, on a cable that can be cut.
-struct Motors {
+pub(crate) struct Motors {
     seen: Arc<Mutex<Vec<Seen>>>,
     is_cut: Arc<AtomicBool>,
     fails: Arc<AtomicBool>,
@@ -49,7 +49,7 @@ struct Motors {
 }
 
 impl Motors {
-    fn new(bus: BusConfig, configs: Vec<MotorConfig>, ignore_timeout: bool) -> Self {
+    pub(crate) fn new(bus: BusConfig, configs: Vec<MotorConfig>, ignore_timeout: bool) -> Self {
         let flag = || Arc::new(AtomicBool::new(false));
         let (is_cut, fails, stop) = (flag(), flag(), flag());
         let seen = Arc::<Mutex<Vec<Seen>>>::default();
@@ -107,7 +107,7 @@ impl Motors {
         self.seen.lock().expect("no panics")
     }
 
-    fn wait_until(&self, what: &str, is_so: impl Fn(&[Seen]) -> bool) {
+    pub(crate) fn wait_until(&self, what: &str, is_so: impl Fn(&[Seen]) -> bool) {
         let began = clock::now();
         while !is_so(&self.seen()) {
             let waited = clock::now().duration_since(began);
@@ -116,7 +116,7 @@ impl Motors {
         }
     }
 
-    fn states(&self) -> Vec<State> {
+    pub(crate) fn states(&self) -> Vec<State> {
         self.seen().iter().map(|seen| seen.state).collect()
     }
 
@@ -150,7 +150,7 @@ fn joint_rad(config: &MotorConfig, motor_rad: f64) -> f64 {
     motor_rad * per_turn + config.offset_rad
 }
 
-fn movable(bus: BusConfig, motors: &[MotorConfig], on_loss: OnLoss) -> MovableArmConfig {
+pub(crate) fn movable(bus: BusConfig, motors: &[MotorConfig], on_loss: OnLoss) -> MovableArmConfig {
     let with_gains = |motor: &MotorConfig| {
         let has_gains = !matches!(motor.family, Family::Odrive { .. } | Family::Cia402 { .. });
         MotorConfig { gains: has_gains.then_some(GAINS), ..motor.clone() }
@@ -199,7 +199,7 @@ fn wait_until_held(arm: &mut MovableCanArm) {
 }
 
 /// Why it stopped, once it has.
-fn wait_until_stopped(arm: &MovableCanArm) -> String {
+pub(crate) fn wait_until_stopped(arm: &MovableCanArm) -> String {
     let began = clock::now();
     loop {
         if let Motion::Stopped { reason } = arm.motion() {

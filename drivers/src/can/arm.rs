@@ -155,7 +155,7 @@ impl Line {
                 }
                 // Cycles that were missed are not made up for.
                 next_cycle = (next_cycle + self.cycle.period).max(now);
-                self.look_for_silence(&heard, now)?;
+                self.look_for_silence(&heard, now, &errors)?;
             }
             let left = if self.cycle.questions.is_empty() { POLL } else { next_cycle.duration_since(now).min(POLL) };
             match self.bus.receive(left)? {
@@ -173,28 +173,32 @@ impl Line {
                     }
                 }
                 Some((_, Arrived::Errors(more))) => self.tell_errors(&mut errors, &more),
-                None => self.look_for_silence(&heard, clock::now())?,
+                None => self.look_for_silence(&heard, clock::now(), &errors)?,
             }
         }
         let seconds = clock::now().secs_since(began);
         let interface = &self.bus.config().interface;
         let load = 100.0 * self.bus.busy().as_secs_f64() / seconds.max(1e-9);
         log::info!(
-            "{interface}: {load:.1} % of the bus was in use, stuff bits left out; {n_unsent} questions found no room, {n_dropped} readings were dropped"
+            "{interface}: {load:.1} % of the bus was in use, stuff bits left out; {n_unsent} questions found no room, {n_dropped} readings were dropped; \
+             errors on the wire: {errors}"
         );
         Ok(())
     }
 
-    /// The first motor that has said nothing for too long is an error: the joints' states stop with it.
-    fn look_for_silence(&self, heard: &[Stamp], now: Stamp) -> Result<(), Error> {
-        match self.motors.iter().zip(heard).find(|(_, heard)| now.duration_since(**heard) > MAX_SILENCE) {
-            Some(((_, motor), _)) => Err(Error::Motor {
-                joint: motor.config().joint.clone(),
-                interface: self.bus.config().interface.clone(),
-                reason: format!("it has said nothing for {MAX_SILENCE:?}"),
-            }),
-            None => Ok(()),
+    /// The first motor that has said nothing for too long is an error: the joints' states stop with it. What was wrong on the wire is
+    /// told with it, for a bus that is lost silences motors, too.
+    fn look_for_silence(&self, heard: &[Stamp], now: Stamp, errors: &WireErrors) -> Result<(), Error> {
+        let silent = |heard: &Stamp| now.duration_since(*heard) > MAX_SILENCE;
+        let Some(((_, motor), _)) = self.motors.iter().zip(heard).find(|(_, heard)| silent(heard)) else {
+            return Ok(());
+        };
+        let mut reason = format!("it has said nothing for {MAX_SILENCE:?}");
+        if errors.n_frames > 0 {
+            reason += &format!("; errors on the wire so far: {errors}");
         }
+        let interface = self.bus.config().interface.clone();
+        Err(Error::Motor { joint: motor.config().joint.clone(), interface, reason })
     }
 
     /// Logs errors on the wire: every time that the bus was lost, and others each time that they have doubled.
@@ -202,7 +206,7 @@ impl Line {
         let before = sum.n_frames.checked_ilog2();
         sum.add(more);
         if more.n_bus_off + more.n_restarts > 0 || sum.n_frames.checked_ilog2() != before {
-            log::warn!("{}: errors on the wire so far: {sum:?}", self.bus.config().interface);
+            log::warn!("{}: errors on the wire so far: {sum}", self.bus.config().interface);
         }
     }
 }

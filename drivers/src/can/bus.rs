@@ -39,6 +39,8 @@ pub struct WireErrors {
     pub n_bus_off: u64,
     /// It came back.
     pub n_restarts: u64,
+    /// It passed the mark of 96 errors.
+    pub n_warnings: u64,
     /// It passed the mark of 128 errors.
     pub n_passive: u64,
     /// Nobody acknowledged a frame: there is no one else, or no one at this bit rate.
@@ -56,6 +58,7 @@ impl WireErrors {
             n_frames: 1,
             n_bus_off: error.is_bus_off().into(),
             n_restarts: error.is_restarted().into(),
+            n_warnings: (has(ControllerProblems::RX_WARNING) || has(ControllerProblems::TX_WARNING)).into(),
             n_passive: (has(ControllerProblems::RX_PASSIVE) || has(ControllerProblems::TX_PASSIVE)).into(),
             n_unacknowledged: error.is_no_ack().into(),
             n_overflows: (has(ControllerProblems::RX_OVERFLOW) || has(ControllerProblems::TX_OVERFLOW)).into(),
@@ -67,9 +70,22 @@ impl WireErrors {
         self.n_frames += more.n_frames;
         self.n_bus_off += more.n_bus_off;
         self.n_restarts += more.n_restarts;
+        self.n_warnings += more.n_warnings;
         self.n_passive += more.n_passive;
         self.n_unacknowledged += more.n_unacknowledged;
         self.n_overflows += more.n_overflows;
+    }
+}
+
+impl std::fmt::Display for WireErrors {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { n_frames, n_bus_off, n_restarts, n_warnings, n_passive, n_unacknowledged, n_overflows } = self;
+        let times = if *n_bus_off == 1 { "time" } else { "times" };
+        write!(
+            f,
+            "{n_bus_off} {times} off the bus, {n_restarts} back; {n_warnings} warnings, {n_passive} passive, \
+             {n_unacknowledged} frames not acknowledged, {n_overflows} overflows; {n_frames} error frames in all"
+        )
     }
 }
 
@@ -106,8 +122,8 @@ impl Bus {
         Duration::from_nanos(self.busy_nanos.load(Ordering::Relaxed))
     }
 
-    /// Sends a frame; waits a moment where the interface's queue is full. False where it stayed full, as it does while the
-    /// controller is off the bus or nobody acknowledges.
+    /// Sends a frame; waits a moment where the interface's queue is full. False where it stayed full, as it does while nobody
+    /// acknowledges. True says no more than that the kernel took it: those for a controller that is off the bus it takes and drops.
     pub fn send(&self, frame: &Frame) -> Result<bool, Error> {
         let began = clock::now();
         loop {

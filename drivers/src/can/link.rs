@@ -116,7 +116,7 @@ impl Link {
             Some(bitrate_hz) => {
                 complain(format!("its bit rate is {bitrate_hz}, the rig file says {}", wanted.bitrate_hz));
             }
-            None => complain(format!("no bit rate is set, the rig file says {}", wanted.bitrate_hz)),
+            None => complain(format!("no bit rate is set, {} is wanted", wanted.bitrate_hz)),
         }
         if let Some(data_bitrate_hz) = wanted.data_bitrate_hz.filter(|rate| self.data_bitrate_hz != Some(*rate)) {
             let is = self.data_bitrate_hz.map_or_else(|| "not set".to_owned(), |rate| rate.to_string());

@@ -89,7 +89,8 @@ impl<'a> Talk<'a> {
             }
         }
         let errors = self.errors.get();
-        Err(self.fault(match errors.n_unacknowledged + errors.n_bus_off {
+        // Not every controller's driver tells that frames are not acknowledged; all tell what their counters come to by that.
+        Err(self.fault(match errors.n_unacknowledged + errors.n_passive + errors.n_bus_off {
             0 => format!("no answer to {MAX_ASKED} questions; is the motor powered and its number right?"),
             _ => "nobody acknowledges frames: the others are off, at another bit rate, or the bus is cut or not terminated"
                 .to_owned(),

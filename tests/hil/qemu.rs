@@ -1,0 +1,104 @@
+//! On the host: a machine that QEMU plays, with two Kvaser PCI cards on one CAN bus, and faults of their chips.
+//!
+//! QEMU's chip (SJA1000, `hw/net/can/can_sja1000.c`) makes no errors: no line of it sets the bits of its status for errors and the
+//! bus being lost, nor their interrupts, and its error counters always read 0. So these bits are bent from outside, in QEMU's memory,
+//! as a debugger would; all that follows is done by the kernel's driver of real chips and what lies above it.
+
+use super::{run, write_script};
+use std::fs;
+use std::io::Write;
+use std::os::unix::fs::FileExt;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+pub(crate) const PROGRAM: &str = "/usr/bin/qemu-system-x86_64";
+/// That of busybox does not know bit rates.
+pub(crate) const IP: &str = "/usr/sbin/ip";
+
+/// What the kernel runs first.
+const INIT: &str = r#"#!/bin/busybox sh
+bb=/bin/busybox
+$bb mount -t proc proc /proc
+$bb mount -t sysfs sysfs /sys
+$bb mount -t devtmpfs dev /dev
+$bb mount -t tmpfs tmp /tmp
+$bb stty -echo
+export LD_LIBRARY_PATH=/lib PATH=/bin
+/bin/hil --ignored --test-threads=1 --nocapture kvaser::
+echo "hil: exit $?"
+$bb poweroff -f
+"#;
+
+/// Here everybody is root; what a person is told to type begins with `sudo`. With its path no command is taken for one of busybox.
+const SUDO: &str = "#!/bin/busybox sh\nexec /bin/\"$@\"\n";
+
+/// How a test inside asks for a chip to be bent: interface, bits of its status and its interrupts, both hexadecimal.
+pub(crate) const BEND: &str = "hil: bend ";
+/// What it is answered, a line.
+pub(crate) const BENT: &str = "bent";
+/// A chip takes all frames while these are the last half of its acceptance registers; the first half is then free to name it.
+pub(crate) const ACCEPT_ALL: [u8; 4] = [0xFF; 4];
+/// Bits of the chip's status that say that it has errors and that it is off the bus.
+const STATUS_ERRORS: u8 = 0xC0;
+
+pub(crate) fn lay_out(root: &Path) {
+    super::lay_out(root, INIT, &[(PathBuf::from(IP), "ip")]);
+    write_script(&root.join("bin/sudo"), SUDO);
+}
+
+/// Boots and waits for the end; returns what came on the console.
+pub(crate) fn boot(kernel: &Path, root: &Path) -> String {
+    let mut command = Command::new(PROGRAM);
+    command
+        .args(["-machine", "pc", "-accel", "tcg", "-cpu", "max", "-smp", "1", "-m", "768"])
+        .args(["-nodefaults", "-no-user-config", "-display", "none", "-no-reboot", "-serial", "stdio"])
+        .args(["-object", "can-bus,id=bus", "-device", "kvaser_pci,canbus=bus", "-device", "kvaser_pci,canbus=bus"])
+        .arg("-fsdev")
+        .arg(format!("local,id=root,path={},security_model=none,readonly=on", root.display()))
+        .args(["-device", "virtio-9p-pci,fsdev=root,mount_tag=root"])
+        .arg("-kernel")
+        .arg(kernel)
+        .arg("-append")
+        .arg(
+            "console=ttyS0 root=root rootfstype=9p rootflags=trans=virtio,version=9p2000.L,cache=loose,msize=262144 \
+             ro init=/init quiet panic=-1 no_timer_check",
+        )
+        .stdin(Stdio::piped());
+    run(&mut command, |machine, line| {
+        if let Some((_, asked)) = line.split_once(BEND) {
+            let answer = match bend(machine.id(), asked.trim()) {
+                Ok(()) => BENT.to_owned(),
+                Err(why) => format!("not bent: {why}"),
+            };
+            // Where the machine has ended by now, its console tells.
+            let _ = writeln!(machine.stdin.as_mut().expect("piped"), "{answer}");
+        }
+    })
+}
+
+/// Sets the bits for errors in a chip's status, and adds interrupts to those that it has yet to tell.
+///
+/// The chip is found by its acceptance registers: the test inside has written the interface's name there. In QEMU these follow on
+/// mode, status, interrupts, enabled interrupts, messages waiting, their place, and clock divider, a byte each.
+fn bend(machine: u32, asked: &str) -> std::io::Result<()> {
+    let words: Vec<&str> = asked.split(' ').collect();
+    let &[interface, status, interrupts] = words.as_slice() else { panic!("three words, not {asked}") };
+    let [status, interrupts] = [status, interrupts].map(|hex| u8::from_str_radix(hex, 16).expect("hexadecimal"));
+    let maps = fs::read_to_string(format!("/proc/{machine}/maps"))?;
+    let heap = maps.lines().find(|line| line.ends_with("[heap]")).expect("QEMU has one");
+    let (from, to) = heap.split_once(' ').and_then(|(range, _)| range.split_once('-')).expect("FROM-TO");
+    let [from, to] = [from, to].map(|hex| u64::from_str_radix(hex, 16).expect("hexadecimal"));
+    let memory = fs::OpenOptions::new().read(true).write(true).open(format!("/proc/{machine}/mem"))?;
+    let mut bytes = vec![0; usize::try_from(to - from).expect("64 bits")];
+    memory.read_exact_at(&mut bytes, from)?;
+    let acceptance = [interface.as_bytes(), &ACCEPT_ALL].concat();
+    // The highest bit of the clock divider says that the chip speaks as the driver expects: a copy elsewhere has not that before it.
+    let is_chip = |at: &usize| bytes[*at..].starts_with(&acceptance) && bytes[*at - 1] & 0x80 != 0;
+    let found: Vec<usize> = (7..bytes.len() - acceptance.len()).filter(is_chip).collect();
+    let &[at] = found.as_slice() else {
+        return Err(std::io::Error::other(format!("{interface} is {} times in QEMU's memory", found.len())));
+    };
+    let (status_at, interrupts_at) = (at - 6, at - 5);
+    memory.write_all_at(&[bytes[status_at] & !STATUS_ERRORS | status], from + status_at as u64)?;
+    memory.write_all_at(&[bytes[interrupts_at] | interrupts], from + interrupts_at as u64)
+}
