@@ -1,10 +1,8 @@
 //! A RealSense camera of a rig file: opened, and what the rig file leaves to it filled in.
 
-use crate::config::Camera;
-
 /// Opens a camera.
 #[cfg(not(feature = "realsense"))]
-pub(super) fn open(camera: &mut Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
+pub(super) fn open(camera: &mut crate::config::Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
     anyhow::bail!(
         "camera {:?}: this program was built without RealSense cameras: install the RealSense SDK (librealsense2) and build it with \
          `cargo build --release --features realsense`",
