@@ -8,7 +8,7 @@ use realsense_rust::kind::Rs2Option;
 use realsense_sys as sys;
 use std::collections::BTreeSet;
 
-/// Y'CbCr as librealsense2 itself takes it (`src/proc/color-formats-converter.cpp`): BT.601, limited range.
+/// Luma and colour differences as librealsense2 itself takes it (`src/proc/color-formats-converter.cpp`): BT.601, limited range.
 const YUV_COLORS: YuvColors = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited };
 /// Formats of images, the best first: what the camera itself sends before what the library makes of it.
 const FORMATS: [(sys::rs2_format, &str, PixelFormat); 5] = [
@@ -93,8 +93,7 @@ impl Wanted {
         let mode_at = |(sensor, mode): (usize, usize)| &modes[sensor].modes[mode];
         let rank = |place: &(usize, usize)| self.formats.iter().position(|format| *format == mode_at(*place).format);
         all().filter(|place| self.fits(mode_at(*place), rate_hz)).min_by_key(rank).ok_or_else(|| {
-            let offered: BTreeSet<String> =
-                all().map(mode_at).filter(|mode| self.is_of(mode)).map(|mode| describe(mode)).collect();
+            let offered: BTreeSet<String> = all().map(mode_at).filter(|mode| self.is_of(mode)).map(describe).collect();
             let offered: Vec<_> = offered.into_iter().collect();
             let [width, height] = self.size_px;
             let rate = rate_hz.map_or(String::new(), |rate_hz| format!(" at {rate_hz} Hz"));

@@ -327,12 +327,15 @@ fn stream(stream: sys::rs2_stream, unique_id: i32, rate_hz: u16, intrinsics: &In
     }
 }
 
-/// Images that the library has, by address: it says only where they were when it gives them back. Beside each whose it is.
-static LENT: Mutex<BTreeMap<usize, (u64, Box<[u8]>)>> = Mutex::new(BTreeMap::new());
+/// Images by address, and beside each which file it is for.
+type Lent = BTreeMap<usize, (u64, Box<[u8]>)>;
+
+/// Images that the library has: it says only where they were when it gives them back.
+static LENT: Mutex<Lent> = Mutex::new(BTreeMap::new());
 /// Files begun so far.
 static N_FILES: AtomicU64 = AtomicU64::new(0);
 
-fn lent() -> MutexGuard<'static, BTreeMap<usize, (u64, Box<[u8]>)>> {
+fn lent() -> MutexGuard<'static, Lent> {
     LENT.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
