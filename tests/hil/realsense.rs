@@ -285,6 +285,20 @@ fn a_file_by_the_clock_begins_when_its_stamps_say_so() {
 }
 
 #[test]
+fn a_file_that_nobody_reads_to_its_end_is_let_go() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (path, camera) = (folder.path().join("long.bag"), d435i([640, 480], Lens::Pinhole));
+    // More than all queues together hold.
+    record(&path, &camera, 10 * N_IMAGES);
+    let mut open = RealsenseCamera::open(config(path, &camera, Pace::Fast)).expect("a file");
+    open.next_image(PATIENCE).expect("its first image");
+    std::thread::sleep(Duration::from_millis(500));
+    let began = Instant::now();
+    drop(open);
+    assert!(began.elapsed() < PATIENCE, "{:?}", began.elapsed());
+}
+
+#[test]
 fn what_a_file_does_not_hold_is_told_and_filters_fill_holes() {
     let folder = tempfile::tempdir().unwrap();
     let camera = d435i([640, 480], Lens::Pinhole);

@@ -11,12 +11,15 @@ use crate::{Error, Image, PixelFormat, clock};
 use realsense_rust::frame::{FrameEx, ImageFrame};
 use realsense_rust::kind::{Rs2FrameMetadata, Rs2StreamKind};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 /// Images of all streams that may wait while we copy one: a quarter of a second of two streams at 30 Hz.
 const N_WAITING: u8 = 16;
 /// How soon the end of a file is noticed.
 const POLL: Duration = Duration::from_millis(100);
+/// How soon the end of a stop is noticed.
+const DRAIN: Duration = Duration::from_millis(10);
 /// A file that has given no image for this long is at its end, or holds none.
 const MAX_BEGIN: Duration = Duration::from_secs(2);
 /// Exposures of depth are told in microseconds.
@@ -218,7 +221,18 @@ fn warn_of(camera: &str, found: &Found) {
 }
 
 impl Drop for Running {
+    /// The reader of a file waits for room in the queue, and the library's stop for that reader: so the queue is emptied meanwhile.
     fn drop(&mut self) {
-        self.started.stop(&self.device);
+        let (queue, is_stopped) = (&self.queue, AtomicBool::new(false));
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                while !is_stopped.load(Ordering::Relaxed) {
+                    // What still comes is not wanted any more.
+                    let _ = queue.wait(DRAIN);
+                }
+            });
+            self.started.stop(&self.device);
+            is_stopped.store(true, Ordering::Relaxed);
+        });
     }
 }

@@ -341,6 +341,9 @@ pub(super) struct Queue(NonNull<sys::rs2_frame_queue>);
 // SAFETY: as for `Context`.
 unsafe impl Send for Queue {}
 
+// SAFETY: the library locks its queues.
+unsafe impl Sync for Queue {}
+
 impl Queue {
     pub(super) fn new(capacity: u8) -> Result<Self, Problem> {
         const WHAT: &str = "make a queue";
