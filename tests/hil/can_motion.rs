@@ -6,7 +6,7 @@ use drivers::can::played::{self, Played, State};
 use drivers::can::{Arrived, Bus, BusConfig, Family, Gains, MotorConfig, MovableArmConfig, MovableCanArm};
 use drivers::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
 use drivers::wire::can::cia402::Units;
-use drivers::wire::can::{canopen, odrive, robstride};
+use drivers::wire::can::{Frame, Id, canopen, odrive, robstride};
 use drivers::{Arm, clock};
 use kinematics::Stamp;
 use socketcan::{CanErrorFrame, CanSocket, Socket};
@@ -271,8 +271,8 @@ fn commands_keep_the_limits_and_joints_arrive_together() {
         let last = *way.last().expect("it moved");
         way.iter().rposition(|rad| (rad - last).abs() > 2e-3).expect("it moved")
     });
-    // Both buses have had as many cycles, but for one that is on its way; the last counts of a way are long ones.
-    assert!(last_change[0].abs_diff(last_change[1]) < 12, "{last_change:?}");
+    // Alone the second joint would be there hundreds of cycles earlier; the last counts of a short way are long ones.
+    assert!(last_change[0].abs_diff(last_change[1]) < 40, "{last_change:?}");
     const WINDOW: usize = 40;
     const COUNT_RAD: f64 = 25.0 / 65_535.0;
     let secs = WINDOW as f64 / RATE_HZ;
@@ -391,6 +391,45 @@ fn a_cut_cable_a_link_that_is_down_and_a_lost_bus_stop_the_arm_for_good() {
             }
         }
     }
+}
+
+#[test]
+#[ignore = "needs the virtual kernel"]
+fn nonsense_in_the_motors_names_stops_the_arm_at_worst() {
+    let wire = Wire::new("vcan12", false);
+    let configs = watched();
+    let motors = Motors::new(wire.config(false), configs.clone(), false);
+    let mut arm = MovableCanArm::open(&movable(wire.config(false), &configs, OnLoss::Release)).expect("they are on");
+    arm.command(&JointTarget { position: vec![1.0; configs.len()] }).expect("within the limits");
+    let noise = Bus::open(&wire.config(false)).expect("it is up");
+    // Answers of each of them, and what else comes from motors: feedback, PDOs, SDO answers, heartbeats.
+    let ids = [Id::standard(0x11), Id::extended(0x0280_03FD), Id::extended(0x1100_03FD), Id::standard(0x081)]
+        .into_iter()
+        .chain([0x089, 0x085, 0x185, 0x285, 0x585, 0x705].map(Id::standard))
+        .map(|id| id.expect("in range"));
+    let ids: Vec<Id> = ids.collect();
+    let mut random = 7_u64;
+    let mut next = || {
+        random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        usize::try_from(random >> 33).expect("31 bits")
+    };
+    for _ in 0..3000 {
+        let bytes: Vec<u8> = (0..next() % 9).map(|_| next().to_le_bytes()[0]).collect();
+        let frame = Frame::classic(ids[next() % ids.len()], &bytes).expect("at most eight bytes");
+        noise.send(&frame).expect("it is up");
+        std::thread::sleep(Duration::from_micros(300));
+    }
+    let reason = wait_until_stopped(&arm);
+    println!("can: 3000 frames of nonsense: {reason}");
+    motors.wait_until("none obeys", |seen| seen.iter().all(|seen| seen.state != State::Obeys));
+    for seen in motors.seen().iter() {
+        let steps = seen.commanded_rad.windows(2).map(|way| (way[1] - way[0]).abs());
+        let most = steps.fold(0.0, f64::max);
+        assert!(most <= LIMITS.velocity / RATE_HZ + 25.2 / 65_535.0, "a step of {most} rad");
+    }
+    std::thread::sleep(Duration::from_millis(500));
+    arm.recover().expect("the motors answer as before");
+    assert!(motors.states().iter().all(|state| *state == State::Obeys));
 }
 
 /// What a controller tells that goes off the bus.
