@@ -6,14 +6,14 @@ use drivers::can::played::{self, Played, State};
 use drivers::can::{Arrived, Bus, BusConfig, Family, Gains, MotorConfig, MovableArmConfig, MovableCanArm};
 use drivers::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
 use drivers::wire::can::cia402::Units;
-use drivers::wire::can::{canopen, odrive, robstride};
+use drivers::wire::can::{Frame, Id, canopen, odrive, robstride};
 use drivers::{Arm, clock};
 use kinematics::Stamp;
 use socketcan::{CanErrorFrame, CanSocket, Socket};
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Child, Command, Stdio};
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -22,8 +22,10 @@ const CHILD: &str = "FIELDRIG_HIL_CHILD";
 const RATE_HZ: f64 = 200.0;
 /// A kernel without real time on a busy machine stands still for tens of milliseconds at a time.
 const TIMEOUT: Duration = Duration::from_millis(250);
-/// How much later than its timeout a played motor may be seen to have stopped: its thread waits for processor time, too.
-const SLACK: Duration = Duration::from_millis(60);
+/// How much later than its timeout a played motor may be seen to have stopped, besides what its own thread waited for.
+const SLACK: Duration = Duration::from_millis(30);
+/// How much later the arm may tell it on a busy machine.
+const TOLD_SLACK: Duration = Duration::from_millis(300);
 const LIMITS: MotionLimits = MotionLimits { position: [-2.0, 2.0], velocity: 1.0, acceleration: 2.0, jerk: 20.0 };
 const GAINS: Gains = Gains { stiffness_nm_rad: 30.0, damping_nm_s_rad: 1.5 };
 const UNITS: Units = Units { counts_per_turn: 65_536.0, rated_torque_nm: 10.0 };
@@ -44,6 +46,8 @@ pub(crate) struct Motors {
     seen: Arc<Mutex<Vec<Seen>>>,
     is_cut: Arc<AtomicBool>,
     fails: Arc<AtomicBool>,
+    /// The longest that this thread itself stood still since it was asked for last, nanoseconds.
+    stood_still: Arc<AtomicU64>,
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
@@ -51,10 +55,11 @@ pub(crate) struct Motors {
 impl Motors {
     pub(crate) fn new(bus: BusConfig, configs: Vec<MotorConfig>, ignore_timeout: bool) -> Self {
         let flag = || Arc::new(AtomicBool::new(false));
-        let (is_cut, fails, stop) = (flag(), flag(), flag());
+        let (is_cut, fails, stop, stood_still) = (flag(), flag(), flag(), Arc::<AtomicU64>::default());
         let seen = Arc::<Mutex<Vec<Seen>>>::default();
         let (cut, failing, stopping, looking) =
             (Arc::clone(&is_cut), Arc::clone(&fails), Arc::clone(&stop), Arc::clone(&seen));
+        let standing = Arc::clone(&stood_still);
         let bus = Bus::open(&bus).expect("it is up");
         let thread = std::thread::spawn(move || {
             let mut played: Vec<_> = configs.iter().map(|config| Played::new(config.family, DAMIAO_LIMITS)).collect();
@@ -62,10 +67,14 @@ impl Motors {
             if ignore_timeout {
                 played.iter_mut().for_each(Played::ignore_timeout);
             }
+            let mut before = clock::now();
             while !stopping.load(Ordering::Relaxed) {
                 // A link that is down says so once.
                 let arrived = bus.receive(Duration::from_millis(1)).unwrap_or(None);
                 let now = clock::now();
+                let gap = u64::try_from(now.nanos_since(before)).expect("the clock is monotonic");
+                standing.fetch_max(gap, Ordering::Relaxed);
+                before = now;
                 let mut sent = Vec::new();
                 if failing.swap(false, Ordering::Relaxed) {
                     played[0].fail();
@@ -77,7 +86,10 @@ impl Motors {
                     {
                         let before = motor.target();
                         sent.extend(motor.take(frame).expect("it fits"));
-                        let is_new = motor.target() != before || motor.fed_at() == Some(now);
+                        // Other frames quiet the watchdogs of axes and drives, too.
+                        let has_own_loop = matches!(config.family, Family::Odrive { .. } | Family::Cia402 { .. });
+                        let is_fed = motor.fed_at() == Some(now) && !has_own_loop;
+                        let is_new = motor.target() != before || is_fed;
                         if let (Some(target), true) = (motor.target(), is_new) {
                             commanded_rad.push(joint_rad(config, target.position_rad));
                         }
@@ -87,7 +99,7 @@ impl Motors {
                     let _ = bus.send(frame); // As above.
                 }
                 let state = played.iter().zip(&configs).zip(&commanded_rad);
-                *looking.lock().expect("no panics") = state
+                *looking.lock().unwrap_or_else(PoisonError::into_inner) = state
                     .map(|((motor, config), commanded_rad)| Seen {
                         state: motor.state(),
                         position_rad: joint_rad(config, motor.motion().position_rad),
@@ -98,13 +110,13 @@ impl Motors {
                     .collect();
             }
         });
-        let motors = Self { seen, is_cut, fails, stop, thread: Some(thread) };
+        let motors = Self { seen, is_cut, fails, stood_still, stop, thread: Some(thread) };
         motors.wait_until("they are there", |seen| !seen.is_empty());
         motors
     }
 
     fn seen(&self) -> MutexGuard<'_, Vec<Seen>> {
-        self.seen.lock().expect("no panics")
+        self.seen.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     pub(crate) fn wait_until(&self, what: &str, is_so: impl Fn(&[Seen]) -> bool) {
@@ -131,7 +143,8 @@ impl Motors {
         });
         let after = |seen: &Seen| seen.lost_at.expect("as waited for").duration_since(since);
         let after: Vec<Duration> = self.seen().iter().map(after).collect();
-        assert!(after.iter().all(|after| *after < TIMEOUT + SLACK), "{after:?}");
+        let stood_still = Duration::from_nanos(self.stood_still.swap(0, Ordering::Relaxed));
+        assert!(after.iter().all(|after| *after < TIMEOUT + SLACK + stood_still), "{after:?} {stood_still:?}");
         after.iter().map(|after| 1e3 * after.as_secs_f64()).collect()
     }
 }
@@ -140,7 +153,8 @@ impl Drop for Motors {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
-            thread.join().expect("motors do not panic");
+            let has_panicked = thread.join().is_err();
+            assert!(!has_panicked || std::thread::panicking(), "motors do not panic");
         }
     }
 }
@@ -234,9 +248,17 @@ fn motors_of_all_families_go_where_they_are_sent_and_back() {
         let target = JointTarget { position: target };
         assert_eq!(arm.command(&target).expect("within the limits"), target);
         wait_until_held(&mut arm);
-        let state = arm.read(Duration::from_secs(1)).expect("they report");
-        let (told, true_) = (off(&state.position, &target.position), off(&motors.positions(), &target.position));
-        println!("can: sent to {:?}, off by {true_:.6?} rad, told within {told:.6?} rad", target.position);
+        // Half a count of velocity carries a reading on for as long as the others' take.
+        const CARRIED_RAD: f64 = 1e-4;
+        let mut told = [f64::INFINITY; 6];
+        for _ in 0..50 {
+            let state = arm.read(Duration::from_secs(1)).expect("they report");
+            for (least, off) in told.iter_mut().zip(off(&state.position, &target.position)) {
+                *least = least.min(off - CARRIED_RAD);
+            }
+        }
+        let true_ = off(&motors.positions(), &target.position);
+        println!("can: sent to {:?}, off by {true_:.6?} rad", target.position);
         assert!(is_right(&told) && is_right(&true_), "{told:?} {true_:?}");
     }
     // Targets outside the range are brought into it; others change nothing.
@@ -271,8 +293,8 @@ fn commands_keep_the_limits_and_joints_arrive_together() {
         let last = *way.last().expect("it moved");
         way.iter().rposition(|rad| (rad - last).abs() > 2e-3).expect("it moved")
     });
-    // Both buses have had as many cycles, but for one that is on its way; the last counts of a way are long ones.
-    assert!(last_change[0].abs_diff(last_change[1]) < 12, "{last_change:?}");
+    // Alone the second joint would be there hundreds of cycles earlier; the last counts of a short way are long ones.
+    assert!(last_change[0].abs_diff(last_change[1]) < 40, "{last_change:?}");
     const WINDOW: usize = 40;
     const COUNT_RAD: f64 = 25.0 / 65_535.0;
     let secs = WINDOW as f64 / RATE_HZ;
@@ -346,6 +368,7 @@ fn a_cut_cable_a_link_that_is_down_and_a_lost_bus_stop_the_arm_for_good() {
             let side = if motors.positions()[0] > 0.0 { -1.0 } else { 1.0 };
             arm.command(&JointTarget { position: vec![side; n] }).expect("it is switched on");
             std::thread::sleep(Duration::from_millis(600));
+            motors.stood_still.store(0, Ordering::Relaxed);
             let began = clock::now();
             match how {
                 "the cable is cut" => motors.is_cut.store(true, Ordering::Relaxed),
@@ -355,7 +378,7 @@ fn a_cut_cable_a_link_that_is_down_and_a_lost_bus_stop_the_arm_for_good() {
             }
             let reason = wait_until_stopped(&arm);
             let told_after = clock::now().duration_since(began);
-            assert!(told_after < TIMEOUT + SLACK, "{how}: {told_after:?}");
+            assert!(told_after < TIMEOUT + TOLD_SLACK, "{how}: {told_after:?}");
             // Where nothing of us reaches them they stop by themselves; else they were told to.
             let is_mute = ["the cable is cut", "the link is down"].contains(&how);
             let after_millis = if is_mute { motors.wait_until_lost(began, state) } else { Vec::new() };
@@ -391,6 +414,45 @@ fn a_cut_cable_a_link_that_is_down_and_a_lost_bus_stop_the_arm_for_good() {
             }
         }
     }
+}
+
+#[test]
+#[ignore = "needs the virtual kernel"]
+fn nonsense_in_the_motors_names_stops_the_arm_at_worst() {
+    let wire = Wire::new("vcan12", false);
+    let configs = watched();
+    let motors = Motors::new(wire.config(false), configs.clone(), false);
+    let mut arm = MovableCanArm::open(&movable(wire.config(false), &configs, OnLoss::Release)).expect("they are on");
+    arm.command(&JointTarget { position: vec![1.0; configs.len()] }).expect("within the limits");
+    let noise = Bus::open(&wire.config(false)).expect("it is up");
+    // Answers of each of them, and what else comes from motors: feedback, PDOs, SDO answers, heartbeats.
+    let ids = [Id::standard(0x11), Id::extended(0x0280_03FD), Id::extended(0x1100_03FD), Id::standard(0x081)]
+        .into_iter()
+        .chain([0x089, 0x085, 0x185, 0x285, 0x585, 0x705].map(Id::standard))
+        .map(|id| id.expect("in range"));
+    let ids: Vec<Id> = ids.collect();
+    let mut random = 7_u64;
+    let mut next = || {
+        random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        usize::try_from(random >> 33).expect("31 bits")
+    };
+    for _ in 0..3000 {
+        let bytes: Vec<u8> = (0..next() % 9).map(|_| next().to_le_bytes()[0]).collect();
+        let frame = Frame::classic(ids[next() % ids.len()], &bytes).expect("at most eight bytes");
+        noise.send(&frame).expect("it is up");
+        std::thread::sleep(Duration::from_micros(300));
+    }
+    let reason = wait_until_stopped(&arm);
+    println!("can: 3000 frames of nonsense: {reason}");
+    motors.wait_until("none obeys", |seen| seen.iter().all(|seen| seen.state != State::Obeys));
+    for seen in motors.seen().iter() {
+        let steps = seen.commanded_rad.windows(2).map(|way| (way[1] - way[0]).abs());
+        let most = steps.fold(0.0, f64::max);
+        assert!(most <= LIMITS.velocity / RATE_HZ + 25.2 / 65_535.0, "a step of {most} rad");
+    }
+    std::thread::sleep(Duration::from_millis(500));
+    arm.recover().expect("the motors answer as before");
+    assert!(motors.states().iter().all(|state| *state == State::Obeys));
 }
 
 /// What a controller tells that goes off the bus.
@@ -462,6 +524,7 @@ fn a_program_that_is_killed_or_stopped_leaves_the_motors_to_their_watchdogs() {
             |seen: &[Seen]| seen.iter().all(|seen| seen.state == State::Obeys && seen.velocity_rad_s.abs() > 0.3);
         motors.wait_until("the child moves the arm", is_on_its_way);
 
+        motors.stood_still.store(0, Ordering::Relaxed);
         signal(&child, "-STOP");
         let began = clock::now();
         let after = motors.wait_until_lost(began, state);
@@ -490,6 +553,7 @@ fn a_program_that_is_killed_or_stopped_leaves_the_motors_to_their_watchdogs() {
         next("child: recovered");
         motors.wait_until("the child moves the arm again", is_on_its_way);
 
+        motors.stood_still.store(0, Ordering::Relaxed);
         signal(&child, "-KILL");
         let began = clock::now();
         let after = motors.wait_until_lost(began, state);

@@ -125,6 +125,11 @@ impl Bus {
     /// Sends a frame; waits a moment where the interface's queue is full. False where it stayed full, as it does while nobody
     /// acknowledges. True says no more than that the kernel took it: those for a controller that is off the bus it takes and drops.
     pub fn send(&self, frame: &Frame) -> Result<bool, Error> {
+        self.send_within(frame, MAX_SENDING)
+    }
+
+    /// The same, with another bound: what is of this instant only must not wait.
+    pub fn send_within(&self, frame: &Frame, bound: Duration) -> Result<bool, Error> {
         let began = clock::now();
         loop {
             match self.write(frame) {
@@ -133,25 +138,13 @@ impl Bus {
                     return Ok(true);
                 }
                 Err(error) if error.raw_os_error() == Some(ENOBUFS) || error.should_retry() => {
-                    if clock::now().duration_since(began) >= MAX_SENDING {
+                    if clock::now().duration_since(began) >= bound {
                         return Ok(false);
                     }
                     std::thread::sleep(Duration::from_micros(200));
                 }
                 Err(source) => return Err(self.refused(source)),
             }
-        }
-    }
-
-    /// Sends a frame, or not where the interface's queue is full: what is of this instant only must not wait.
-    pub fn try_send(&self, frame: &Frame) -> Result<bool, Error> {
-        match self.write(frame) {
-            Ok(()) => {
-                self.count(frame);
-                Ok(true)
-            }
-            Err(error) if error.raw_os_error() == Some(ENOBUFS) || error.should_retry() => Ok(false),
-            Err(source) => Err(self.refused(source)),
         }
     }
 

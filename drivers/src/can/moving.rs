@@ -31,6 +31,8 @@ const MIN_CYCLES: u32 = 4;
 const MIN_UNHEARD: u64 = 3;
 /// How long motors may take to say where they are, and that they are switched on.
 const MAX_STARTING: Duration = Duration::from_secs(2);
+/// A queue of ten frames, as interfaces have it, is half empty after so long.
+const MAX_QUEUED: Duration = Duration::from_micros(800);
 /// How soon a thread with nothing to do looks whether it is asked for something.
 const POLL: Duration = Duration::from_millis(20);
 /// Beyond the time that its limits need, an arm that ends may take so long to come to rest.
@@ -203,10 +205,8 @@ impl Moving {
                     let _ = answer.try_send(Err(error));
                 }
             },
-            (Request::Recover(answer), _) => {
-                let reason = "it is switched on, there is nothing to recover from".to_owned();
-                let _ = answer.try_send(Err(Error::Motion { reason }));
-            }
+            // It is switched on, or is being so.
+            (Request::Recover(answer), _) => drop(answer.try_send(Ok(()))),
         }
     }
 
@@ -480,7 +480,7 @@ impl Ready {
     fn ask(&self, question: impl Fn(&Mover) -> Option<Frame>) -> Result<(), Error> {
         for mover in &self.movers {
             if let Some(question) = question(mover) {
-                self.bus_of(mover).try_send(&question)?;
+                self.bus_of(mover).send_within(&question, MAX_QUEUED)?;
             }
         }
         Ok(())
@@ -493,7 +493,7 @@ impl Ready {
             let command = mover.command(setpoint.position[ix], setpoint.velocity[ix]);
             let command = command.map_err(|error| self.fault(mover, error.to_string()))?;
             // A frame without room in the queue is let go: the next one is better.
-            self.bus_of(mover).try_send(&command)?;
+            self.bus_of(mover).send_within(&command, MAX_QUEUED)?;
         }
         self.sent_rad = setpoint.position;
         Ok(())
@@ -512,8 +512,8 @@ impl Ready {
     /// Says that we live, and gives the beat at which drives take their targets.
     fn beat(&self, host: canopen::Node) -> Result<(), Error> {
         for bus in self.buses_with_drives() {
-            bus.try_send(&canopen::encode_heartbeat(host, NodeState::Operational))?;
-            bus.try_send(&canopen::encode_sync())?;
+            bus.send_within(&canopen::encode_heartbeat(host, NodeState::Operational), MAX_QUEUED)?;
+            bus.send_within(&canopen::encode_sync(), MAX_QUEUED)?;
         }
         Ok(())
     }
@@ -548,7 +548,7 @@ impl Ready {
     fn leave(&self, words: impl Fn(&Mover, f64) -> Result<Vec<Frame>, CanError>) {
         for (mover, sent_rad) in self.movers.iter().zip(&self.sent_rad) {
             for frame in words(mover, *sent_rad).unwrap_or_default() {
-                let _ = self.bus_of(mover).try_send(&frame);
+                let _ = self.bus_of(mover).send_within(&frame, MAX_QUEUED);
             }
         }
     }

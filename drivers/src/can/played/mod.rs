@@ -260,3 +260,109 @@ fn is_due(last: &mut Option<Stamp>, now: Stamp, every: Duration) -> bool {
     }
     due
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::ROBSTRIDE_HOST;
+    use super::*;
+    use crate::wire::can::canopen::{self, Direction, Nmt, Node, Pdo};
+    use crate::wire::can::{Id, damiao as dm, robstride as rs};
+
+    const LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
+    const MILLIS: i64 = 1_000_000;
+
+    /// Lets time pass, and gives it frames at the end.
+    fn give(motor: &mut Played, at_millis: i64, frames: &[Result<Frame, CanError>]) {
+        motor.report(Stamp(at_millis * MILLIS)).expect("it fits");
+        for frame in frames {
+            motor.take(frame.as_ref().expect("a frame")).expect("it fits");
+        }
+    }
+
+    fn is_lost_between(motor: &mut Played, fed_millis: i64, timeout_millis: i64) {
+        give(motor, fed_millis + timeout_millis, &[]);
+        assert_eq!((motor.state(), motor.lost_at()), (State::Obeys, None), "not yet");
+        give(motor, fed_millis + timeout_millis + 1, &[]);
+        assert_ne!(motor.state(), State::Obeys);
+        assert_eq!(motor.lost_at(), Some(Stamp((fed_millis + timeout_millis + 1) * MILLIS)));
+    }
+
+    #[test]
+    fn a_damiao_motor_lets_go_after_its_timeout_and_obeys_only_when_its_error_is_cleared() {
+        let mut motor = Played::new(Family::Damiao { motor: 1, feedback: 0x11 }, LIMITS);
+        let write = |register, value| {
+            let access = dm::Access::Write(register, dm::Value::Whole(value));
+            dm::encode_register(&dm::RegisterMessage { motor: 1, access }, None)
+        };
+        let command = Command { position_rad: 0.5, kp_nm_rad: 30.0, kd_nm_s_rad: 1.5, ..Command::default() };
+        let set_up = [write(dm::Register::Timeout, 2000), write(dm::Register::ControlMode, dm::MIT_MODE)];
+        give(&mut motor, 0, &set_up);
+        give(&mut motor, 1, &[dm::encode_command(1, &command, &LIMITS)]);
+        assert_eq!((motor.state(), motor.target()), (State::Free, None), "it is off");
+        let enable = || dm::encode_order(1, dm::Order::Enable);
+        give(&mut motor, 2, &[enable(), dm::encode_command(1, &command, &LIMITS)]);
+        give(&mut motor, 10, &[dm::encode_command(1, &command, &LIMITS)]);
+        assert!(motor.motion().position_rad > 0.0);
+        is_lost_between(&mut motor, 10, 100);
+        give(&mut motor, 200, &[enable()]);
+        assert_eq!(motor.state(), State::Free, "its error stands");
+        give(&mut motor, 201, &[dm::encode_order(1, dm::Order::ClearError), enable()]);
+        assert_eq!(motor.state(), State::Obeys);
+    }
+
+    #[test]
+    fn a_robstride_motor_lets_go_unless_its_timeout_was_not_taken() {
+        let model = rs::Model::Rs02;
+        for ignores in [false, true] {
+            let mut motor = Played::new(Family::Robstride { motor: 3, model }, LIMITS);
+            if ignores {
+                motor.ignore_timeout();
+            }
+            let say = |request| rs::encode_request(ROBSTRIDE_HOST, 3, &request, &model.limits());
+            let timeout = rs::timeout(0.05).expect("in range");
+            give(&mut motor, 0, &[say(rs::Request::Write(rs::Parameter::Timeout, timeout)), say(rs::Request::Enable)]);
+            match ignores {
+                false => is_lost_between(&mut motor, 0, 50),
+                true => give(&mut motor, 5000, &[]),
+            }
+            assert_eq!(motor.state() == State::Obeys, ignores);
+        }
+    }
+
+    #[test]
+    fn a_drive_stays_where_a_quick_stop_brought_it_when_the_heartbeat_ends() {
+        let (node, host) = (Node::new(5).expect("a node"), Node::new(127).expect("a node"));
+        let units = cia402::Units { counts_per_turn: 65_536.0, rated_torque_nm: 1.0 };
+        let mut motor = Played::new(Family::Cia402 { node, units }, LIMITS);
+        let write = |object, value| canopen::encode_write(node, object, value);
+        let (direction, pdo) = (Direction::Receive, Pdo::First);
+        let id = pdo.id(direction, node);
+        give(
+            &mut motor,
+            0,
+            &[
+                write(canopen::CONSUMER_HEARTBEAT, canopen::consumer_heartbeat(host, 100).into()),
+                write(cia402::ABORT_CONNECTION, cia402::ABORT_BY_QUICK_STOP),
+                write(cia402::QUICK_STOP_OPTION, cia402::STAY_STOPPED),
+                write(cia402::MODE, cia402::Mode::CyclicPosition as i64),
+                write(pdo.mapping(direction, 1), cia402::CONTROLWORD.mapped().into()),
+                write(pdo.mapping(direction, 2), cia402::TARGET_POSITION.mapped().into()),
+                write(pdo.communication(direction, 2), 1),
+                write(pdo.communication(direction, 1), id.value().into()),
+                Ok(canopen::encode_nmt(Nmt::Start, Some(node))),
+            ],
+        );
+        for (at_millis, controlword) in [(1, 0x06), (2, 0x07), (3, 0x0F), (50, 0x0F)] {
+            let target = Frame::classic(id, &[controlword, 0, 0, 0x40, 0, 0]);
+            let heartbeat = canopen::encode_heartbeat(host, NodeState::Operational);
+            give(&mut motor, at_millis, &[target, Ok(heartbeat), Ok(canopen::encode_sync())]);
+        }
+        assert_eq!(motor.state(), State::Obeys);
+        is_lost_between(&mut motor, 50, 100);
+        assert_eq!(motor.state(), State::Held);
+        give(&mut motor, 2000, &[]);
+        let held = motor.motion();
+        give(&mut motor, 3000, &[Frame::classic(Id::standard(0x705).expect("11 bits"), &[5])]);
+        assert_eq!((motor.motion(), motor.motion().velocity_rad_s), (held, 0.0));
+    }
+}
