@@ -3,7 +3,7 @@
 use super::section::Section;
 use super::write::{is, name_of, table};
 use drivers::motion::OnLoss;
-use toml::Table;
+use toml::{Table, Value};
 
 /// How an arm may be moved; an arm without this table is only read.
 #[derive(Clone, Debug, PartialEq)]
@@ -18,6 +18,14 @@ pub(crate) struct ArmMotion {
     pub(crate) jerk_secs: f64,
     /// Whether motors that do not notice the silence are moved all the same.
     pub(crate) accept_no_watchdog: bool,
+    /// Torques from outside at which a Franka arm stops, Nm, in the order of its joints; `None` here and below is as its driver has it.
+    pub(crate) contact_torque_nm: Option<[f64; 7]>,
+    /// Forces from outside at its end effector at which it stops, N.
+    pub(crate) contact_force_n: Option<[f64; 3]>,
+    /// And moments, Nm.
+    pub(crate) contact_moment_nm: Option<[f64; 3]>,
+    /// Stiffness of its joints, Nm/rad.
+    pub(crate) stiffness_nm_rad: Option<[f64; 7]>,
     /// Path of `ODrive`'s `flat_endpoints.json`; empty where there is none.
     pub(crate) odrive_endpoints: String,
 }
@@ -33,6 +41,10 @@ pub(super) fn read(mut keys: Section<'_>) -> Option<ArmMotion> {
     let acceleration_secs = keys.number("acceleration_secs", 0.01..=10.0).unwrap_or(0.5);
     let jerk_secs = keys.number("jerk_secs", 0.001..=10.0).unwrap_or(0.1);
     let accept_no_watchdog = keys.flag("accept_no_watchdog").unwrap_or(false);
+    let contact_torque_nm = keys.numbers("contact_torque_nm", 1.0..=100.0);
+    let contact_force_n = keys.numbers("contact_force_n", 1.0..=100.0);
+    let contact_moment_nm = keys.numbers("contact_moment_nm", 1.0..=100.0);
+    let stiffness_nm_rad = keys.numbers("stiffness_nm_rad", 10.0..=14250.0);
     let odrive_endpoints = keys.text("odrive_endpoints").unwrap_or_default();
     keys.end();
     Some(ArmMotion {
@@ -41,6 +53,10 @@ pub(super) fn read(mut keys: Section<'_>) -> Option<ArmMotion> {
         acceleration_secs,
         jerk_secs,
         accept_no_watchdog,
+        contact_torque_nm,
+        contact_force_n,
+        contact_moment_nm,
+        stiffness_nm_rad,
         odrive_endpoints,
     })
 }
@@ -52,6 +68,14 @@ pub(super) fn write(motion: &ArmMotion) -> Table {
         ("acceleration_secs", is(motion.acceleration_secs)),
         ("jerk_secs", is(motion.jerk_secs)),
         ("accept_no_watchdog", is(motion.accept_no_watchdog)),
+        ("contact_torque_nm", numbers(&motion.contact_torque_nm)),
+        ("contact_force_n", numbers(&motion.contact_force_n)),
+        ("contact_moment_nm", numbers(&motion.contact_moment_nm)),
+        ("stiffness_nm_rad", numbers(&motion.stiffness_nm_rad)),
         ("odrive_endpoints", is(motion.odrive_endpoints.as_str())),
     ])
+}
+
+fn numbers<const N: usize>(numbers: &Option<[f64; N]>) -> Option<Value> {
+    numbers.as_ref().map(|numbers| Value::from(numbers.to_vec()))
 }

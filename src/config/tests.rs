@@ -71,7 +71,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a good value that differs from the one in force, and a value that is not allowed.
-const KEYS: [(&str, &str, &str); 152] = [
+const KEYS: [(&str, &str, &str); 156] = [
     ("arm.rate_hz", "500", "0"),
     ("arm.bus.can0.bitrate_hz", "500_000", "1"),
     ("arm.bus.can0.data_bitrate_hz", "5_000_000", "9_000_000"),
@@ -94,6 +94,10 @@ const KEYS: [(&str, &str, &str); 152] = [
     ("arm.motion.acceleration_secs", "1", "0"),
     ("arm.motion.jerk_secs", "0.2", "0"),
     ("arm.motion.accept_no_watchdog", "true", "1"),
+    ("arm.motion.contact_torque_nm", "[9, 9, 9, 9, 9, 9, 9]", "[20, 20]"),
+    ("arm.motion.contact_force_n", "[10, 10, 10]", "[0, 0, 0]"),
+    ("arm.motion.contact_moment_nm", "[10, 10, 10.5]", "20"),
+    ("arm.motion.stiffness_nm_rad", "[3000, 3000, 3000, 2500, 2500, 2000, 2000]", "[1, 1, 1, 1, 1, 1, 1]"),
     ("arm.motion.odrive_endpoints", "'flat_endpoints.json'", "7"),
     ("arm.driver", "'franka'", "'frankka'"),
     ("arm.driver", "'none'", "'nothing'"),

@@ -5,7 +5,7 @@ use anyhow::{Context, bail};
 #[cfg(target_os = "linux")]
 use drivers::can::{self, CanArm, MovableArmConfig, MovableCanArm};
 #[cfg(target_os = "linux")]
-use drivers::franka::{self, FrankaArm};
+use drivers::franka::{self, FrankaArm, MovableFrankaArm};
 use drivers::motion::{MotionConfig, MotionLimits, MovableArm};
 use drivers::udp::{UdpArm, UdpBase, UdpScanner};
 use drivers::v4l2::{Config, Settings, V4l2Camera, V4l2Format};
@@ -58,6 +58,7 @@ pub(crate) fn movable_arm(rig: &Rig) -> anyhow::Result<Box<dyn MovableArm>> {
     };
     match rig.arm.driver {
         ArmDriver::Can => movable_can_arm(rig, motion),
+        ArmDriver::Franka => movable_franka_arm(rig, motion),
         _ => bail!("arms of this driver are only read"),
     }
 }
@@ -119,13 +120,35 @@ fn can_arm(_rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
 /// A Franka arm, over FCI.
 #[cfg(target_os = "linux")]
 fn franka_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
+    Ok(Box::new(FrankaArm::open(&franka_config(rig)?)?))
+}
+
+/// A Franka arm that may be moved, over FCI.
+#[cfg(target_os = "linux")]
+fn movable_franka_arm(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<Box<dyn MovableArm>> {
+    let usual = franka::ContactConfig::default();
+    let contact = franka::ContactConfig {
+        torque_nm: motion.contact_torque_nm.unwrap_or(usual.torque_nm),
+        force_n: motion.contact_force_n.unwrap_or(usual.force_n),
+        moment_nm: motion.contact_moment_nm.unwrap_or(usual.moment_nm),
+        stiffness_nm_rad: motion.stiffness_nm_rad,
+    };
+    let arm = MovableFrankaArm::open(&franka_config(rig)?, &motion_config(rig, motion)?, &contact)?;
+    Ok(Box::new(arm))
+}
+
+#[cfg(not(target_os = "linux"))]
+fn movable_franka_arm(_rig: &Rig, _motion: &ArmMotion) -> anyhow::Result<Box<dyn MovableArm>> {
+    bail!("Franka arms are moved on Linux only")
+}
+
+#[cfg(target_os = "linux")]
+fn franka_config(rig: &Rig) -> anyhow::Result<franka::ArmConfig> {
     let Rig { arm, .. } = rig;
     if arm.address.is_empty() {
         bail!("arm.address is missing: that of the robot's controller, for instance \"172.16.0.2\"");
     }
-    let chain = franka_chain(rig)?;
-    let config = franka::ArmConfig { address: arm.address.clone(), joint_names: arm.joints.clone(), chain };
-    Ok(Box::new(FrankaArm::open(&config)?))
+    Ok(franka::ArmConfig { address: arm.address.clone(), joint_names: arm.joints.clone(), chain: franka_chain(rig)? })
 }
 
 /// From the link in which a Franka arm tells poses to its flange.

@@ -1,5 +1,6 @@
 //! An arm that is read: a thread takes the robot's states, the caller gets them as joint states.
 
+use super::mover::{Mover, Timed};
 use super::session::{Session, sentence};
 use super::state::{MAX_STATE_BYTES, Numbered, decode, pose};
 use super::{N_JOINTS, Statistics, realtime};
@@ -9,6 +10,7 @@ use crate::{Arm, Error, clock};
 use franka::{FciVersion, RobotMode, RobotState};
 use kinematics::{Chain, JointState, Stamp, Transform};
 use std::collections::VecDeque;
+use std::net::SocketAddr;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -21,6 +23,8 @@ const MAX_SILENCE: Duration = Duration::from_secs(1);
 const MAX_OFF_M: f64 = 2e-3;
 const MAX_OFF_RAD: f64 = 0.5 / 180.0 * std::f64::consts::PI;
 const NANOS_PER_STATE: i64 = 1_000_000;
+/// A robot that was not answered for so long has given up: what came meanwhile is not answered any more.
+const MAX_AWAY: Duration = Duration::from_millis(20);
 
 /// An arm as the rig file has it.
 #[derive(Clone, Debug)]
@@ -61,16 +65,23 @@ struct Waiting {
 impl FrankaArm {
     /// Connects, checks that the rig file describes this robot, and starts to read.
     pub fn open(config: &ArmConfig) -> Result<Self, Error> {
+        Self::open_with(config, |_, _| Ok(None))
+    }
+
+    /// The same, with what moves the arm by its states, made once there is one.
+    pub(super) fn open_with(
+        config: &ArmConfig,
+        mover: impl FnOnce(&Arc<Session>, &RobotState) -> Result<Option<Mover>, String>,
+    ) -> Result<Self, Error> {
         let address = &config.address;
         let fault = |reason| Error::Fci { address: address.clone(), reason };
         let n = config.joint_names.len();
         if n != N_JOINTS || config.chain.n_joints() != N_JOINTS {
             return Err(fault(format!("the rig file names {n} joints of the arm, which has {N_JOINTS}")));
         }
-        let session = Session::open(address)?;
-        let Session { network, version } = &session;
+        let session = Arc::new(Session::open(address)?);
+        let Session { network, version } = &*session;
         let version = *version;
-        let mut line = Line::new(address.clone(), version);
         let until = clock::now() + MAX_SILENCE;
         let mut buffer = [0; MAX_STATE_BYTES];
         let first = loop {
@@ -88,6 +99,8 @@ impl FrankaArm {
             }
         };
         check_kinematics(config, &first).map_err(fault)?;
+        let mover = mover(&session, &first).map_err(fault)?;
+        let mut line = Line::new(address.clone(), version, mover);
         line.tell_mode(&first);
         let shared = Arc::new(Shared::default());
         let device = format!("arm at {address}");
@@ -203,16 +216,20 @@ struct Line {
     version: FciVersion,
     order: Order,
     mode: RobotMode,
+    mover: Option<Mover>,
 }
 
 impl Line {
-    fn new(address: String, version: FciVersion) -> Self {
-        Self { address, version, order: Order::default(), mode: RobotMode::Other }
+    fn new(address: String, version: FciVersion, mover: Option<Mover>) -> Self {
+        Self { address, version, order: Order::default(), mode: RobotMode::Other, mover }
     }
 
     fn run(mut self, session: &Session, shared: &Shared) {
         realtime::claim(&format!("arm at {}", self.address));
         if let Err(reason) = self.read(session, shared) {
+            if let Some(mover) = &mut self.mover {
+                mover.lose(&reason);
+            }
             shared.lock().error = Some(Error::Fci { address: self.address, reason });
             shared.arrived.notify_all();
         }
@@ -224,28 +241,31 @@ impl Line {
         let mut buffer = [0; MAX_STATE_BYTES];
         let mut heard = clock::now();
         loop {
-            let received = network.udp.blocking_receive(&mut buffer);
+            let mut received = network.udp.blocking_receive(&mut buffer).ok();
             let at = clock::now();
-            // From anywhere else it is no state.
-            let is_its = network.udp_peer().is_some_and(|peer| peer.ip() == network.server_ip);
-            let numbered = received.as_ref().ok().map(|n| decode(self.version, &buffer[..*n]).filter(|_| is_its));
-            let mut waiting = shared.lock();
-            if waiting.stop {
+            let is_fresh = at.duration_since(heard) <= MAX_AWAY;
+            let mut newest = None;
+            while let Some(n) = received {
+                // From anywhere else it is no state.
+                let from = network.udp_peer().filter(|peer| peer.ip() == network.server_ip);
+                let state = from.zip(decode(self.version, &buffer[..n]));
+                if !self.hear(shared, state, at, &mut newest) {
+                    return Ok(());
+                }
+                received = network.udp.try_receive(&mut buffer).unwrap_or(None);
+            }
+            if let Some((from, numbered, stamp)) = newest {
+                heard = at;
+                shared.arrived.notify_all();
+                self.tell_mode(&numbered.state);
+                if let Some(mover) = &mut self.mover {
+                    mover.turn(&Timed { numbered: &numbered, stamp, from, is_fresh });
+                }
+                continue;
+            }
+            if shared.lock().stop {
                 return Ok(());
             }
-            match numbered {
-                Some(Some(numbered)) => {
-                    heard = at;
-                    self.take(&mut waiting, &numbered, at);
-                    drop(waiting);
-                    shared.arrived.notify_all();
-                    self.tell_mode(&numbered.state);
-                    continue;
-                }
-                Some(None) => waiting.statistics.n_refused += 1,
-                None => {}
-            }
-            drop(waiting);
             network.tcp.throw_if_connection_closed().map_err(|error| sentence(&error))?;
             let silence = at.duration_since(heard);
             if silence > MAX_SILENCE {
@@ -254,7 +274,28 @@ impl Line {
         }
     }
 
-    fn take(&mut self, waiting: &mut Waiting, numbered: &Numbered, at: Stamp) {
+    /// Takes a datagram, or counts it as no state; whether to go on.
+    fn hear(
+        &mut self,
+        shared: &Shared,
+        state: Option<(SocketAddr, Numbered)>,
+        at: Stamp,
+        newest: &mut Option<(SocketAddr, Numbered, Stamp)>,
+    ) -> bool {
+        let mut waiting = shared.lock();
+        match state {
+            Some((from, numbered)) => {
+                if let Some(stamp) = self.take(&mut waiting, &numbered, at) {
+                    *newest = Some((from, numbered, stamp));
+                }
+            }
+            None => waiting.statistics.n_refused += 1,
+        }
+        !waiting.stop
+    }
+
+    /// Puts a state into the queue, if it is later than all before; when it was told, by our clock.
+    fn take(&mut self, waiting: &mut Waiting, numbered: &Numbered, at: Stamp) -> Option<Stamp> {
         let Numbered { number, state } = numbered;
         let statistics = &mut waiting.statistics;
         match self.order.place(*number, at) {
@@ -262,7 +303,7 @@ impl Line {
             Place::Restart => statistics.n_restarts += 1,
             Place::Newest | Place::Late => {
                 statistics.n_late += 1;
-                return;
+                return None;
             }
         }
         // The robot counts its states by its own clock, one a millisecond.
@@ -270,7 +311,7 @@ impl Line {
         let head = Head { seq: *number, clock: Clock::Device, stamp_nanos };
         let Some(stamp) = self.order.stamp(&head, at) else {
             statistics.n_refused += 1;
-            return;
+            return None;
         };
         statistics.count(at.duration_since(stamp));
         if waiting.queue.len() >= MAX_WAITING {
@@ -283,6 +324,7 @@ impl Line {
             velocity: state.dq.to_vec(),
             effort: state.tau_J.to_vec(),
         });
+        Some(stamp)
     }
 
     /// Logs what the robot is doing whenever that changes.

@@ -70,13 +70,8 @@ fn connect(address: &str, version: u16) -> Result<Answer, String> {
     request.extend(network.udp.port().to_le_bytes());
     let hung_up = |error: FrankaError| format!("it hung up ({}). {WAY_BESIDE}", sentence(&error).trim_end_matches('.'));
     let id = network.tcp.send_request(robot::Command::Connect.to_u32(), &request).map_err(hung_up)?;
-    let until = clock::now() + MAX_ANSWER;
-    let message = loop {
-        match network.tcp.try_receive_response(id).map_err(hung_up)? {
-            Some(message) => break message,
-            None if clock::now() < until => std::thread::sleep(LOOK),
-            None => return Err(format!("it does not answer. {WAY_BESIDE}")),
-        }
+    let Some(message) = answer(&network, id, MAX_ANSWER).map_err(hung_up)? else {
+        return Err(format!("it does not answer. {WAY_BESIDE}"));
     };
     let [status, low, high, ..] = *message_payload(HeaderLayout::Robot, &message) else {
         return Err("its answer to the first message is too short: is it a Franka controller?".to_owned());
@@ -86,6 +81,18 @@ fn connect(address: &str, version: u16) -> Result<Answer, String> {
         (0, told) if told == version => Ok(Answer::Welcome(network)),
         (0 | 1, told) => Ok(Answer::OtherVersion(told)),
         (status, _) => Err(format!("it refuses with status {status}. {WAY_BESIDE}")),
+    }
+}
+
+/// The answer to a request, header and all; `None` where it does not come in time.
+pub(super) fn answer(network: &Network, id: u32, patience: Duration) -> Result<Option<Vec<u8>>, FrankaError> {
+    let until = clock::now() + patience;
+    loop {
+        match network.tcp.try_receive_response(id)? {
+            Some(message) => return Ok(Some(message)),
+            None if clock::now() < until => std::thread::sleep(LOOK),
+            None => return Ok(None),
+        }
     }
 }
 

@@ -1,4 +1,4 @@
-//! How well the states of an arm came through.
+//! How well the states of an arm came through, and the commands of its motions.
 
 use std::time::Duration;
 
@@ -8,7 +8,7 @@ const BIN: Duration = Duration::from_micros(20);
 const N_BINS: usize = 2000;
 
 /// What became of the states of one arm since it was opened.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Statistics {
     /// That came, and were told.
     pub n_received: u64,
@@ -22,23 +22,7 @@ pub struct Statistics {
     pub n_dropped: u64,
     /// How often the robot's clock began anew.
     pub n_restarts: u64,
-    delays: Vec<u64>,
-    longest: Duration,
-}
-
-impl Default for Statistics {
-    fn default() -> Self {
-        Self {
-            n_received: 0,
-            n_lost: 0,
-            n_late: 0,
-            n_refused: 0,
-            n_dropped: 0,
-            n_restarts: 0,
-            delays: vec![0; N_BINS],
-            longest: Duration::ZERO,
-        }
-    }
+    delays: Delays,
 }
 
 impl Statistics {
@@ -54,33 +38,25 @@ impl Statistics {
     ///
     /// Told to 20 us, and up to 40 ms; the latest of all is [`Statistics::longest_delay`].
     pub fn delay(&self, frac: f64) -> Duration {
-        let mut n_left = frac * self.n_received as f64;
-        let bin = self.delays.iter().position(|n| {
-            n_left -= *n as f64;
-            n_left <= 0.0
-        });
-        let ix = u32::try_from(bin.unwrap_or(N_BINS - 1)).expect("there are few bins");
-        (BIN * (ix + 1)).min(self.longest)
+        self.delays.at(frac)
     }
 
     /// How late the latest state came against the quickest ones.
     pub fn longest_delay(&self) -> Duration {
-        self.longest
+        self.delays.longest
     }
 
     /// Counts a state that came so late.
     pub(super) fn count(&mut self, delay: Duration) {
         self.n_received += 1;
-        self.longest = self.longest.max(delay);
-        let bin = usize::try_from(delay.as_micros() / BIN.as_micros()).unwrap_or(usize::MAX);
-        self.delays[bin.min(N_BINS - 1)] += 1;
+        self.delays.count(delay);
     }
 }
 
 impl std::fmt::Display for Statistics {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Self { n_received, n_lost, n_late, n_refused, n_dropped, n_restarts, .. } = self;
-        let [half, most, all] = [self.delay(0.5), self.delay(0.99), self.longest].map(|delay| delay.as_micros());
+        let [half, most, all] = self.delays.told();
         write!(
             f,
             "{n_received} states, {:.2} % of those sent ({n_lost} lost, {n_late} late or twice, {n_refused} refused); half of them \
@@ -91,6 +67,134 @@ impl std::fmt::Display for Statistics {
             write!(f, "; {n_dropped} gave way to newer ones, the robot's clock began anew {n_restarts} times")?;
         }
         Ok(())
+    }
+}
+
+/// What became of the commands of all motions of one arm.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct MotionStatistics {
+    /// Motions that the robot let begin.
+    pub n_motions: u64,
+    /// States that came while one ran.
+    pub n_cycles: u64,
+    /// Of these, that were answered with a command.
+    pub n_answered: u64,
+    /// That came too late to be answered: the robot had gone on without.
+    pub n_stale: u64,
+    /// States that never came, or together with a newer one.
+    pub n_lost: u64,
+    /// Commands that the robot was seen to go on without, by where it is wanted next; where the jerk is small that is not seen.
+    pub n_missed: u64,
+    /// Commands that were held back so that the robot's own limits were kept.
+    pub n_limited: u64,
+    delays: Delays,
+    told: Told,
+}
+
+/// What the robot told of commands that reached it in time.
+#[derive(Clone, Debug, Default, PartialEq)]
+struct Told {
+    n: u64,
+    sum_frac: f64,
+    least_frac: f64,
+}
+
+impl MotionStatistics {
+    /// Share of the robot's states during motions that were answered, 0 to 1; 1 before the first.
+    pub fn success_frac(&self) -> f64 {
+        match self.n_cycles + self.n_lost {
+            0 => 1.0,
+            n => self.n_answered as f64 / n as f64,
+        }
+    }
+
+    /// The robot's own `control_command_success_rate`, 0 to 1: on average, and the least of any 100 commands in a row; `None` where
+    /// no motion was so long.
+    pub fn robots_success_frac(&self) -> Option<[f64; 2]> {
+        let Told { n, sum_frac, least_frac } = self.told;
+        (n > 0).then(|| [sum_frac / n as f64, least_frac])
+    }
+
+    /// How long after the quickest state could have come commands were sent: a share of them no later than this; 1 is all of them.
+    pub fn delay(&self, frac: f64) -> Duration {
+        self.delays.at(frac)
+    }
+
+    /// Counts a command that went so late.
+    pub(super) fn count(&mut self, delay: Duration) {
+        self.n_answered += 1;
+        self.delays.count(delay);
+    }
+
+    /// Counts what the robot tells of its last 100 commands.
+    pub(super) fn count_told(&mut self, frac: f64) {
+        let Told { n, sum_frac, least_frac } = &mut self.told;
+        *least_frac = if *n == 0 { frac } else { least_frac.min(frac) };
+        *n += 1;
+        *sum_frac += frac;
+    }
+}
+
+impl std::fmt::Display for MotionStatistics {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { n_motions, n_cycles, n_stale, n_lost, n_missed, n_limited, delays, .. } = self;
+        let [half, most, all] = delays.told();
+        write!(
+            f,
+            "{n_motions} motions of {n_cycles} cycles, {:.2} % answered ({n_lost} states lost, {n_stale} too late), half of them within \
+             {half} us of the quickest state, 99 % within {most} us, all within {all} us",
+            100.0 * self.success_frac()
+        )?;
+        if let Some([mean, least]) = self.robots_success_frac() {
+            let [mean, least] = [mean, least].map(|frac| 100.0 * frac);
+            write!(f, "; the robot took {mean:.2} % in time, of any 100 at least {least:.0} %")?;
+        }
+        if *n_missed + *n_limited > 0 {
+            write!(f, "; it was seen to go on without {n_missed} of them, {n_limited} were held back by its limits")?;
+        }
+        Ok(())
+    }
+}
+
+/// How many delays were how long.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Delays {
+    n: u64,
+    bins: Vec<u64>,
+    longest: Duration,
+}
+
+impl Default for Delays {
+    fn default() -> Self {
+        Self { n: 0, bins: vec![0; N_BINS], longest: Duration::ZERO }
+    }
+}
+
+impl Delays {
+    fn count(&mut self, delay: Duration) {
+        self.n += 1;
+        self.longest = self.longest.max(delay);
+        let bin = usize::try_from(delay.as_micros() / BIN.as_micros()).unwrap_or(usize::MAX);
+        self.bins[bin.min(N_BINS - 1)] += 1;
+    }
+
+    /// No longer than this is a share of them, to a bin's width; 1 is the longest.
+    fn at(&self, frac: f64) -> Duration {
+        if frac >= 1.0 {
+            return self.longest;
+        }
+        let mut n_left = frac * self.n as f64;
+        let bin = self.bins.iter().position(|n| {
+            n_left -= *n as f64;
+            n_left <= 0.0
+        });
+        let ix = u32::try_from(bin.unwrap_or(N_BINS - 1)).expect("there are few bins");
+        (BIN * (ix + 1)).min(self.longest)
+    }
+
+    /// Half of them, 99 % of them, all of them, us.
+    fn told(&self) -> [u128; 3] {
+        [0.5, 0.99, 1.0].map(|frac| self.at(frac).as_micros())
     }
 }
 
@@ -113,5 +217,18 @@ mod tests {
         statistics.n_lost = 1001;
         assert_eq!(statistics.success_frac(), 0.5);
         assert!(statistics.to_string().contains("50.00 %"), "{statistics}");
+    }
+
+    #[test]
+    fn what_a_robot_tells_of_commands_is_told_beside_what_was_sent() {
+        let mut statistics = MotionStatistics { n_cycles: 3, n_lost: 1, ..MotionStatistics::default() };
+        assert_eq!(statistics.robots_success_frac(), None);
+        statistics.count(Duration::from_millis(1));
+        statistics.count_told(0.98);
+        statistics.count_told(0.9);
+        assert_eq!(statistics.success_frac(), 0.25);
+        let [mean, least] = statistics.robots_success_frac().unwrap();
+        assert!((mean - 0.94).abs() < 1e-12 && least == 0.9);
+        assert!(statistics.to_string().contains("at least 90 %"), "{statistics}");
     }
 }

@@ -11,24 +11,24 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 const URDF: &str = include_str!("../../../kinematics/tests/data/panda.urdf");
-const FREE_PORT: &str = "127.0.0.1:0";
+pub(super) const FREE_PORT: &str = "127.0.0.1:0";
 /// Long, as a busy machine may be slow; nothing waits so long where all is well.
-const PATIENCE: Duration = Duration::from_secs(20);
-const REST_RAD: [f64; N_JOINTS] = [0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7];
-const VERSIONS: [FciVersion; 2] = [FciVersion::V5, FciVersion::V10];
+pub(super) const PATIENCE: Duration = Duration::from_secs(20);
+pub(super) const REST_RAD: [f64; N_JOINTS] = [0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7];
+pub(super) const VERSIONS: [FciVersion; 2] = [FciVersion::V5, FciVersion::V10];
 
-fn chain(tip: &str) -> Chain {
+pub(super) fn chain(tip: &str) -> Chain {
     Chain::from_urdf(URDF, "link0", tip).unwrap()
 }
 
-fn robot(version: FciVersion, owner: Owner) -> PlayedRobot {
+pub(super) fn robot(version: FciVersion, owner: Owner) -> PlayedRobot {
     let limits = if version == FciVersion::V5 { Limits::panda() } else { Limits::fr3() };
     let flange_from_ee = Transform::new([0.0, 0.0, 0.1034].into(), [0.0, 0.0, -std::f64::consts::FRAC_PI_4].into());
     let address = FREE_PORT.parse().unwrap();
     PlayedRobot::start(RobotConfig { address, version, chain: chain("link8"), flange_from_ee, limits }, owner).unwrap()
 }
 
-fn config(address: SocketAddr) -> ArmConfig {
+pub(super) fn config(address: SocketAddr) -> ArmConfig {
     let chain = chain("link8");
     ArmConfig { address: address.to_string(), joint_names: chain.joint_names().to_vec(), chain }
 }
@@ -46,7 +46,7 @@ fn swing_at(stamp: Stamp) -> Joints {
 }
 
 /// Joints that are where they are wanted.
-fn obedient() -> Owner {
+pub(super) fn obedient() -> Owner {
     let mut is_first = true;
     Box::new(move |_, wanted: &Wanted| {
         let position_rad = if std::mem::take(&mut is_first) { REST_RAD } else { wanted.position_rad };

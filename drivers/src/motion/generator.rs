@@ -6,7 +6,7 @@
 use super::{JointTarget, MotionLimits};
 use rsruckig::prelude::{
     ControlInterface, DataArrayOrVec, InputParameter, OutputParameter, Ruckig, RuckigError, RuckigResult,
-    ThrowErrorHandler,
+    Synchronization, ThrowErrorHandler,
 };
 use std::time::Duration;
 
@@ -84,16 +84,30 @@ impl Generator {
             |(position, joint): (&f64, &MotionLimits)| position.clamp(joint.position[0], joint.position[1]);
         let position: Vec<f64> = target.position.iter().zip(&self.limits).map(into_range).collect();
         self.input.control_interface = ControlInterface::Position;
+        self.input.synchronization = Synchronization::Time;
         self.input.target_position = list(position.iter().copied());
         self.is_held = false;
         Ok(JointTarget { position })
     }
 
-    /// Comes to rest as soon as the limits allow.
+    /// Each joint comes to rest as soon as its limits allow, whatever the others do.
     pub fn stop(&mut self) {
         if !self.is_held {
             self.input.control_interface = ControlInterface::Velocity;
+            self.input.synchronization = Synchronization::None;
         }
+    }
+
+    /// Goes on from another motion than its own towards where it was headed for: where the arm was found to be wanted elsewhere.
+    pub fn resume(&mut self, from: &Setpoint) -> Result<(), String> {
+        for numbers in [&from.position, &from.velocity, &from.acceleration] {
+            check(numbers, self.limits.len())?;
+        }
+        self.input.current_position = list(from.position.iter().copied());
+        self.input.current_velocity = list(from.velocity.iter().copied());
+        self.input.current_acceleration = list(from.acceleration.iter().copied());
+        self.is_held = false;
+        Ok(())
     }
 
     /// Whether it is at rest where it was headed for.
@@ -211,6 +225,40 @@ mod tests {
         assert_eq!(last.velocity, [0.0, 0.0]);
         assert!(last.position[0] > -0.9, "it did not go on to its target");
         assert_eq!(generator.step().unwrap(), *last, "it stays");
+    }
+
+    #[test]
+    fn a_joint_that_is_soon_at_rest_does_not_wait_for_the_others_when_it_stops() {
+        let joint = |jerk| MotionLimits { position: [-1.0, 1.0], velocity: 0.5, acceleration: 2.0, jerk };
+        let mut generator = Generator::new(&[joint(20.0), joint(2.0)], &[0.0, 0.0], PERIOD).unwrap();
+        generator.head_for(&JointTarget { position: vec![0.3, 0.9] }).unwrap();
+        for _ in 0..1000 {
+            generator.step().unwrap();
+        }
+        generator.stop();
+        let mut n_moving = [0, 0];
+        while !generator.is_held() {
+            let velocity = generator.step().unwrap().velocity;
+            n_moving = std::array::from_fn(|ix| n_moving[ix] + u32::from(velocity[ix].abs() > 1e-9));
+        }
+        assert!(n_moving[0] > 10 && 2 * n_moving[0] < n_moving[1], "{n_moving:?}");
+    }
+
+    #[test]
+    fn it_goes_on_from_where_the_arm_was_found_within_the_limits() {
+        let mut generator = at_rest();
+        let target = JointTarget { position: vec![0.9, -0.1] };
+        generator.head_for(&target).unwrap();
+        for _ in 0..300 {
+            generator.step().unwrap();
+        }
+        let found = Setpoint { position: vec![0.2, 0.1], velocity: vec![0.3, -0.2], acceleration: vec![1.0, 0.5] };
+        generator.resume(&found).unwrap();
+        let way = follow(&mut generator);
+        assert!((way[0].position[0] - 0.2003).abs() < 1e-5, "{:?}", way[0]);
+        assert!((way[way.len() - 1].position[0] - 0.9).abs() < 1e-9, "it heads for its target as before");
+        let few = Setpoint { velocity: vec![0.0], ..found };
+        assert!(generator.resume(&few).unwrap_err().contains("1 "));
     }
 
     #[test]

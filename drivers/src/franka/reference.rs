@@ -1,0 +1,184 @@
+//! Where a robot wants its joints, by what it was sent and by what it told.
+
+use super::N_JOINTS;
+use super::limits::STEP_SECS;
+use crate::motion::Setpoint;
+use franka::RobotState;
+
+/// A robot that is wanted further from where we think it is, is wanted elsewhere; below this is what FCI 10 rounds off, up to 8 rad.
+const NEAR_RAD: f64 = 4e-7;
+/// A robot may tell where it was wanted so many steps ago: `franka-sim` tells what its joints' own thread has taken.
+const MAX_BEHIND: f64 = 3.0;
+/// After so many commands that do not come in a row the robot stops. Source: FCI documentation, "Real-time control commands".
+const MAX_MISSED: u64 = 20;
+
+/// Where the joints are wanted, rad, with their rates by differences from millisecond to millisecond, as the robot takes them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Reference {
+    pub(super) position_rad: [f64; N_JOINTS],
+    pub(super) velocity_rad_s: [f64; N_JOINTS],
+    pub(super) acceleration_rad_s2: [f64; N_JOINTS],
+}
+
+/// What became of a command, by the states after it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Fate {
+    /// The robot follows it.
+    Followed,
+    /// The robot went on without so many of them.
+    Missed(u64),
+    /// The robot is wanted elsewhere.
+    Unknown,
+}
+
+impl Reference {
+    /// At rest where a robot tells that it is wanted.
+    pub(super) fn at_rest(state: &RobotState) -> Self {
+        Self { position_rad: state.q_d, velocity_rad_s: [0.0; N_JOINTS], acceleration_rad_s2: [0.0; N_JOINTS] }
+    }
+
+    fn told(state: &RobotState) -> Self {
+        Self { position_rad: state.q_d, velocity_rad_s: state.dq_d, acceleration_rad_s2: state.ddq_d }
+    }
+
+    /// A millisecond later, where it was sent a position.
+    pub(super) fn sent(&self, position_rad: [f64; N_JOINTS]) -> Self {
+        let velocity_rad_s: [f64; N_JOINTS] =
+            std::array::from_fn(|ix| (position_rad[ix] - self.position_rad[ix]) / STEP_SECS);
+        let acceleration_rad_s2 = std::array::from_fn(|ix| (velocity_rad_s[ix] - self.velocity_rad_s[ix]) / STEP_SECS);
+        Self { position_rad, velocity_rad_s, acceleration_rad_s2 }
+    }
+
+    /// A millisecond later, where nothing came: the robot keeps the acceleration.
+    fn missed(&self) -> Self {
+        let velocity_rad_s: [f64; N_JOINTS] =
+            std::array::from_fn(|ix| self.velocity_rad_s[ix] + self.acceleration_rad_s2[ix] * STEP_SECS);
+        Self {
+            position_rad: std::array::from_fn(|ix| self.position_rad[ix] + velocity_rad_s[ix] * STEP_SECS),
+            velocity_rad_s,
+            ..*self
+        }
+    }
+
+    /// So many states later than this one, of which the first was answered with `sent`, and what became of that.
+    ///
+    /// Our own numbers are kept where the robot's are the same but for their rounding: differences of rounded ones are rough. A
+    /// single command that did not arrive is within that rounding where the jerk is small, and is then taken as followed: with the
+    /// next one that arrives that is true again.
+    pub(super) fn later(&self, sent: Option<[f64; N_JOINTS]>, n_states: u64, state: &RobotState) -> (Self, Fate) {
+        let told = Self::told(state);
+        if n_states > MAX_MISSED {
+            return (told, Fate::Unknown);
+        }
+        let go_on = |from: Self, n: u64| (0..n).fold(from, |reference, _| reference.missed());
+        let is_near = |reference: &Self| {
+            let both = reference.position_rad.into_iter().zip(told.position_rad);
+            both.into_iter().all(|(ours, theirs)| (ours - theirs).abs() <= NEAR_RAD)
+        };
+        let n_after = n_states.saturating_sub(1);
+        let with = sent.map(|position_rad| go_on(self.sent(position_rad), n_after)).filter(is_near);
+        match with {
+            Some(with) if n_after == 0 => (with, Fate::Followed),
+            Some(with) => (with, Fate::Missed(n_after)),
+            None => {
+                let without = go_on(*self, n_states);
+                match sent.map(|position_rad| go_on(self.sent(position_rad), n_after)) {
+                    _ if is_near(&without) => (without, Fate::Missed(n_states)),
+                    Some(with) if n_after == 0 && with.is_shortly_after(&told) => (with, Fate::Followed),
+                    _ => (told, Fate::Unknown),
+                }
+            }
+        }
+    }
+
+    /// Whether each joint may have been there a few steps ago.
+    fn is_shortly_after(&self, told: &Self) -> bool {
+        let joints = self.position_rad.into_iter().zip(self.velocity_rad_s).zip(told.position_rad);
+        joints.into_iter().all(|((ours, velocity), theirs)| {
+            (ours - theirs).abs() <= NEAR_RAD + MAX_BEHIND * STEP_SECS * velocity.abs()
+        })
+    }
+
+    /// As a motion without steps: a difference is the rate half a millisecond before.
+    pub(super) fn setpoint(&self) -> Setpoint {
+        let velocity = self.velocity_rad_s.iter().zip(self.acceleration_rad_s2);
+        Setpoint {
+            position: self.position_rad.to_vec(),
+            velocity: velocity.map(|(velocity, acceleration)| velocity + 0.5 * STEP_SECS * acceleration).collect(),
+            acceleration: self.acceleration_rad_s2.to_vec(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The state of a robot of FCI 10 that is wanted there: rounded to floats.
+    #[expect(clippy::cast_possible_truncation, reason = "FCI 10 sends floats")]
+    fn state(reference: &Reference) -> RobotState {
+        let rounded = |numbers: [f64; N_JOINTS]| numbers.map(|number| f64::from(number as f32));
+        let mut state = RobotState::from_wire(&franka::wire::robot::RobotState::default());
+        state.q_d = rounded(reference.position_rad);
+        state.dq_d = rounded(reference.velocity_rad_s);
+        state.ddq_d = rounded(reference.acceleration_rad_s2);
+        state
+    }
+
+    /// In motion, and where it goes next with such a jerk.
+    fn moving(jerk_rad_s3: f64) -> (Reference, [f64; N_JOINTS]) {
+        let reference = Reference {
+            position_rad: [1.9; N_JOINTS],
+            velocity_rad_s: [0.3; N_JOINTS],
+            acceleration_rad_s2: [0.7; N_JOINTS],
+        };
+        let next = reference
+            .position_rad
+            .map(|position| position + STEP_SECS * (0.3 + STEP_SECS * (0.7 + STEP_SECS * jerk_rad_s3)));
+        (reference, next)
+    }
+
+    #[test]
+    fn commands_that_a_robot_follows_and_misses_are_told_apart_though_it_rounds() {
+        let (reference, next) = moving(600.0);
+        let followed = reference.sent(next);
+        assert!((followed.acceleration_rad_s2[0] - 1.3).abs() < 1e-6, "{followed:?}");
+        assert_eq!(reference.later(Some(next), 1, &state(&followed)), (followed, Fate::Followed));
+        let missed = reference.missed();
+        assert_eq!(reference.later(Some(next), 1, &state(&missed)), (missed, Fate::Missed(1)));
+        assert_eq!(reference.later(None, 1, &state(&missed)), (missed, Fate::Missed(1)));
+        let two_later = followed.missed().missed();
+        assert_eq!(reference.later(Some(next), 3, &state(&two_later)), (two_later, Fate::Missed(2)));
+        let three_later = missed.missed().missed();
+        assert_eq!(reference.later(Some(next), 3, &state(&three_later)), (three_later, Fate::Missed(3)));
+    }
+
+    #[test]
+    fn what_is_lost_in_the_rounding_is_taken_as_followed_and_comes_right_with_the_next() {
+        let (reference, next) = moving(20.0);
+        let missed = reference.missed();
+        let (taken, fate) = reference.later(Some(next), 1, &state(&missed));
+        assert_eq!((taken, fate), (reference.sent(next), Fate::Followed));
+        let after = taken.position_rad.map(|position| position + 3e-4);
+        let (taken, fate) = taken.later(Some(after), 1, &state(&missed.sent(after)));
+        assert_eq!((taken.position_rad, fate), (missed.sent(after).position_rad, Fate::Followed));
+    }
+
+    #[test]
+    fn a_robot_that_tells_late_where_it_is_wanted_is_taken_to_follow() {
+        let (reference, next) = moving(20.0);
+        let followed = reference.sent(next);
+        assert_eq!(reference.later(Some(next), 1, &state(&reference)), (followed, Fate::Followed));
+    }
+
+    #[test]
+    fn a_robot_that_is_wanted_elsewhere_is_believed() {
+        let (reference, next) = moving(20.0);
+        let mut elsewhere = reference.sent(next);
+        elsewhere.position_rad[3] += 1e-2;
+        let told = state(&elsewhere);
+        assert_eq!(reference.later(Some(next), 1, &told), (Reference::told(&told), Fate::Unknown));
+        let followed = state(&reference.sent(next));
+        assert_eq!(reference.later(Some(next), 30, &followed).1, Fate::Unknown, "after a long silence");
+    }
+}

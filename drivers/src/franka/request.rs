@@ -1,0 +1,239 @@
+//! What is asked of a controller over TCP and of a motion over UDP, in either version of FCI.
+
+use super::N_JOINTS;
+use super::session::{Session, answer, sentence};
+use franka::wire::robot::{v5, v10};
+use franka::wire::{HeaderLayout, f64s_to_wire, message_payload};
+use franka::{FciVersion, FrankaError, RobotMode};
+use std::time::Duration;
+use zerocopy::IntoBytes;
+use zerocopy::little_endian::U64;
+
+/// Settings and descriptions are answered within milliseconds.
+const MAX_ANSWER: Duration = Duration::from_secs(2);
+/// A recovery opens brakes.
+const MAX_RECOVERY: Duration = Duration::from_secs(10);
+/// How far a motion may be from what was commanded, m, rad and rad of the elbow: as libfranka has it, anything.
+const ANY_DEVIATION: (f64, f64, f64) = (10.0, 3.12, std::f64::consts::TAU);
+
+/// What a robot treats as a collision, and how stiff it is.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ContactConfig {
+    /// Torques from outside at which it stops, Nm, from the base to the flange.
+    pub torque_nm: [f64; N_JOINTS],
+    /// Forces from outside at its end effector at which it stops, along x, y and z of its base, N.
+    pub force_n: [f64; 3],
+    /// Moments at which it stops, about the same axes, Nm.
+    pub moment_nm: [f64; 3],
+    /// Stiffness of its joints, Nm/rad; `None` leaves it as the robot has it.
+    pub stiffness_nm_rad: Option<[f64; N_JOINTS]>,
+}
+
+impl Default for ContactConfig {
+    /// The thresholds of libfranka's examples of joint motions (`generate_joint_position_motion.cpp`).
+    fn default() -> Self {
+        Self {
+            torque_nm: [20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0],
+            force_n: [20.0; 3],
+            moment_nm: [25.0; 3],
+            stiffness_nm_rad: None,
+        }
+    }
+}
+
+/// What became of a motion that a robot let begin, or did not.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Verdict {
+    Begun,
+    Ended,
+    Refused(String),
+}
+
+/// The description that a robot of FCI 10 serves of itself, a URDF.
+pub(super) fn description(session: &Session) -> Result<String, String> {
+    let payload = ask(session, v10::Command::GetRobotModel.to_u32(), &[], MAX_ANSWER)?;
+    match payload.split_first() {
+        Some((0, text)) => Ok(String::from_utf8_lossy(text).into_owned()),
+        Some((status, _)) => {
+            Err(format!("it does not describe itself: {}", told(v10::CommandStatus::from_u8(*status))))
+        }
+        None => Err("its answer to the question for its description is empty".to_owned()),
+    }
+}
+
+/// Sets what counts as a collision and how stiff the joints are; each answer is looked at.
+pub(super) fn set(session: &Session, contact: &ContactConfig) -> Result<(), String> {
+    let ([x, y, z], [about_x, about_y, about_z]) = (contact.force_n, contact.moment_nm);
+    let (torque, force) = (&contact.torque_nm, &[x, y, z, about_x, about_y, about_z]);
+    // Lower thresholds are only told; a robot that speeds up or brakes is judged as one that does not.
+    let collision = v10::SetCollisionBehaviorRequest::new(torque, torque, torque, torque, force, force, force, force);
+    let number = |v5: v5::Command, v10: v10::Command| match session.version {
+        FciVersion::V5 => v5.to_u32(),
+        FciVersion::V10 => v10.to_u32(),
+    };
+    let set = |what: &str, number: u32, payload: &[u8]| {
+        let answer = ask(session, number, payload, MAX_ANSWER)?;
+        match (session.version, first(&answer)?) {
+            (_, 0) => Ok(()),
+            (FciVersion::V5, status) => Err(format!("{what}: {}", told(v5::GetterSetterStatus::from_u8(status)))),
+            (FciVersion::V10, status) => Err(format!("{what}: {}", told(v10::GetterSetterStatus::from_u8(status)))),
+        }
+    };
+    let command = number(v5::Command::SetCollisionBehavior, v10::Command::SetCollisionBehavior);
+    set("it does not take the thresholds of collisions", command, collision.as_bytes())?;
+    let Some(stiffness) = &contact.stiffness_nm_rad else { return Ok(()) };
+    let command = number(v5::Command::SetJointImpedance, v10::Command::SetJointImpedance);
+    set("it does not take the stiffness", command, v10::SetJointImpedanceRequest::new(stiffness).as_bytes())
+}
+
+/// Asks for a motion by joint positions under the robot's own joint impedance; its number, once the robot lets it begin.
+pub(super) fn begin(session: &Session) -> Result<u32, String> {
+    let (translation, rotation, elbow) = ANY_DEVIATION;
+    let deviation = || v10::Deviation::new(translation, rotation, elbow);
+    let stiff = v10::MoveControllerMode::JointImpedance;
+    let request = match session.version {
+        FciVersion::V5 => {
+            let mode = v5::MoveMotionGeneratorMode::JointPosition;
+            v5::MoveRequest::new(stiff, mode, deviation(), deviation()).as_bytes().to_vec()
+        }
+        FciVersion::V10 => {
+            let mode = v10::MoveMotionGeneratorMode::JointPosition;
+            v10::MoveRequest::new(stiff, mode, deviation(), deviation()).as_bytes().to_vec()
+        }
+    };
+    let id = send(session, v10::Command::Move.to_u32(), &request)?;
+    match verdict(session.version, &wait(session, id, MAX_ANSWER)?) {
+        Verdict::Begun => Ok(id),
+        Verdict::Ended => Err("it ended the motion before it began".to_owned()),
+        Verdict::Refused(why) => Err(why),
+    }
+}
+
+/// Ends a motion at once: the robot brakes.
+pub(super) fn halt(session: &Session) -> Result<(), String> {
+    send(session, v10::Command::StopMove.to_u32(), &[]).map(drop)
+}
+
+/// What became of a motion, if the robot has said so.
+pub(super) fn outcome(session: &Session, id: u32) -> Result<Option<Verdict>, String> {
+    let message = session.network.tcp.try_receive_response(id).map_err(|error| sentence(&error))?;
+    Ok(message.map(|message| verdict(session.version, message_payload(HeaderLayout::Robot, &message))))
+}
+
+/// Clears a reflex.
+pub(super) fn recover(session: &Session) -> Result<(), String> {
+    let number = match session.version {
+        FciVersion::V5 => v5::Command::AutomaticErrorRecovery.to_u32(),
+        FciVersion::V10 => v10::Command::AutomaticErrorRecovery.to_u32(),
+    };
+    let answer = ask(session, number, &[], MAX_RECOVERY)?;
+    let why = match (session.version, first(&answer)?) {
+        (_, 0) => return Ok(()),
+        (FciVersion::V5, status) => told(v5::AutomaticErrorRecoveryStatus::from_u8(status)),
+        (FciVersion::V10, status) => told(v10::AutomaticErrorRecoveryStatus::from_u8(status)),
+    };
+    Err(format!("it does not recover: {why}"))
+}
+
+/// Where the joints are to be a millisecond after a state, as a datagram.
+pub(super) fn command(version: FciVersion, number: u64, position_rad: &[f64; N_JOINTS], is_last: bool) -> Vec<u8> {
+    let (message_id, q_c, motion_generation_finished) =
+        (U64::new(number), f64s_to_wire(position_rad), u8::from(is_last));
+    match version {
+        FciVersion::V5 => {
+            let motion = v5::MotionGeneratorCommand { q_c, motion_generation_finished, ..Default::default() };
+            v5::RobotCommand { message_id, motion, ..Default::default() }.as_bytes().to_vec()
+        }
+        FciVersion::V10 => {
+            let motion = v10::MotionGeneratorCommand { q_c, motion_generation_finished, ..Default::default() };
+            v10::RobotCommand { message_id, motion, ..Default::default() }.as_bytes().to_vec()
+        }
+    }
+}
+
+/// Why a robot in that mode lets no motion begin, and what a person does about it; `None` where it is ready.
+pub(super) fn hindrance(mode: RobotMode) -> Option<&'static str> {
+    match mode {
+        RobotMode::Idle => None,
+        RobotMode::Guiding => Some("it is guided by hand: let go of the buttons at its hand"),
+        RobotMode::UserStopped => {
+            Some("its user stop is pressed: release it, for an FR3 also unlock the joints in Desk")
+        }
+        RobotMode::Reflex => Some("it is stopped by a reflex: look at the arm, then recover"),
+        RobotMode::AutomaticErrorRecovery => Some("it is recovering from a reflex"),
+        RobotMode::Move => Some("a motion runs"),
+        RobotMode::Other => Some("it is not ready: unlock its joints and activate FCI in Desk"),
+    }
+}
+
+/// What the status of a motion stands for.
+fn verdict(version: FciVersion, payload: &[u8]) -> Verdict {
+    let Some(status) = payload.first() else { return Verdict::Refused("its answer to a motion is empty".to_owned()) };
+    let name = match version {
+        FciVersion::V5 => v5::MoveStatus::from_u8(*status).map(|status| format!("{status:?}")),
+        FciVersion::V10 => franka::MoveStatus::from_u8(*status).map(|status| format!("{status:?}")),
+    };
+    match name.as_deref() {
+        Some("MotionStarted") => Verdict::Begun,
+        Some("Success") => Verdict::Ended,
+        Some(name) => Verdict::Refused(words(name)),
+        None => Verdict::Refused(format!("status {status}")),
+    }
+}
+
+fn ask(session: &Session, command: u32, payload: &[u8], patience: Duration) -> Result<Vec<u8>, String> {
+    let id = send(session, command, payload)?;
+    wait(session, id, patience)
+}
+
+fn send(session: &Session, command: u32, payload: &[u8]) -> Result<u32, String> {
+    session.network.tcp.send_request(command, payload).map_err(|error| sentence(&error))
+}
+
+/// The payload of the answer.
+fn wait(session: &Session, id: u32, patience: Duration) -> Result<Vec<u8>, String> {
+    let answered = answer(&session.network, id, patience).map_err(|error: FrankaError| sentence(&error))?;
+    let message = answered.ok_or_else(|| format!("it does not answer within {patience:?}"))?;
+    Ok(message_payload(HeaderLayout::Robot, &message).to_vec())
+}
+
+fn first(payload: &[u8]) -> Result<u8, String> {
+    payload.first().copied().ok_or_else(|| "its answer is empty".to_owned())
+}
+
+/// A status by libfranka's name for it, in words.
+fn told<T: std::fmt::Debug>(status: Option<T>) -> String {
+    status.map_or_else(|| "an unknown status".to_owned(), |status| words(&format!("{status:?}")))
+}
+
+/// `CommandNotPossibleRejected` as "command not possible rejected".
+fn words(name: &str) -> String {
+    let mut words = String::new();
+    for letter in name.chars() {
+        if letter.is_uppercase() && !words.is_empty() {
+            words.push(' ');
+        }
+        words.extend(letter.to_lowercase());
+    }
+    words
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_same_status_has_another_number_in_either_version() {
+        assert_eq!(verdict(FciVersion::V5, &[1]), Verdict::Begun);
+        assert_eq!(verdict(FciVersion::V10, &[0]), Verdict::Ended);
+        let refused = |version, status| match verdict(version, &[status]) {
+            Verdict::Refused(why) => why,
+            other => panic!("{other:?}"),
+        };
+        assert_eq!(refused(FciVersion::V5, 3), "command not possible rejected");
+        assert_eq!(refused(FciVersion::V5, 6), "reflex aborted");
+        assert!(refused(FciVersion::V10, 3).contains("safety functions"));
+        assert_eq!(refused(FciVersion::V10, 99), "status 99");
+        assert!(matches!(verdict(FciVersion::V10, &[]), Verdict::Refused(_)));
+    }
+}
