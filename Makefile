@@ -4,7 +4,7 @@
 # the page's npm packages) and says so; without root it prints the one line to run.
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test hil check deps web cargo packages hil-packages mujoco realsense open-ends
+.PHONY: help demo test hil check fuzz deps web cargo packages hil-packages mujoco realsense open-ends
 
 # One feature set everywhere, so that dependencies compile once.
 FEATURES := --features sim
@@ -42,6 +42,11 @@ check: deps realsense open-ends ## Format, clippy, documentation, kernels, licen
 		if cargo deny fetch db >/dev/null 2>&1; then cargo deny check advisories; \
 		else echo "cargo deny: advisories skipped, their database is out of reach"; fi; \
 	else echo "cargo deny: skipped, not installed (cargo install --locked cargo-deny)"; fi
+
+# Of each target.
+SECONDS ?= 600
+fuzz: cargo ## Feed random bytes to every reader, SECONDS=600 each, all or TARGET=can (scripts/fuzz.sh)
+	scripts/fuzz.sh $(SECONDS) $(TARGET)
 
 deps: cargo packages mujoco ## Install what building and testing need
 

@@ -8,6 +8,8 @@ mod decode;
 mod error;
 #[cfg(target_os = "linux")]
 pub mod franka;
+#[cfg(any(test, fuzzing))]
+pub mod hostile;
 pub mod jpeg;
 mod live;
 pub mod motion;
