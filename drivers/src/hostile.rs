@@ -68,6 +68,11 @@ impl Random {
         usize::try_from(self.0 >> 32).expect("32 bits") % most
     }
 
+    /// Any byte.
+    pub(crate) fn byte(&mut self) -> u8 {
+        u8::try_from(self.below(256)).expect("below 256")
+    }
+
     /// Any order.
     pub(crate) fn shuffle<T>(&mut self, items: &mut [T]) {
         for ix in (1..items.len()).rev() {

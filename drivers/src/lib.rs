@@ -13,6 +13,8 @@ pub mod hostile;
 pub mod jpeg;
 mod live;
 pub mod motion;
+#[cfg(feature = "nokhwa")]
+pub mod nokhwa;
 pub mod realsense;
 pub mod recording;
 mod sample;

@@ -7,8 +7,10 @@ use crate::{BasePose, Image, PixelFormat, RangePoint, RangeScan, Sample};
 use crate::{can, franka, udp};
 use kinematics::{Intrinsics, JointState, Lens, Stamp, Transform};
 
+type Reader = fn(&[u8]);
+
 /// What reads the seeds of a folder.
-const READERS: [(&str, fn(&[u8])); 9] = [
+const READERS: [(&str, Reader); 9] = [
     ("can", frames),
     ("udp", datagrams),
     ("fci_states", states),
@@ -45,7 +47,7 @@ fn spoil(bytes: &mut Vec<u8>, random: &mut Random) {
         1 => drop(bytes.drain(a..b)),
         2 => drop(bytes.splice(b..b, bytes[a..b].to_vec())),
         3 => bytes[a..c].rotate_left(b - a),
-        4 => bytes[b.min(c.saturating_sub(1))..c].iter_mut().take(4).for_each(|byte| *byte = random.below(256) as u8),
+        4 => bytes[b.min(c.saturating_sub(1))..c].iter_mut().take(4).for_each(|byte| *byte = random.byte()),
         _ => bytes[a.min(places[2].saturating_sub(1))] ^= 1 << random.below(8),
     }
 }
@@ -65,7 +67,7 @@ fn seeds_cut_doubled_reordered_and_at_random_never_panic() {
             }
         }
         for _ in 0..N_SPOILT {
-            let bytes: Vec<u8> = (0..random.below(300)).map(|_| random.below(256) as u8).collect();
+            let bytes: Vec<u8> = (0..random.below(300)).map(|_| random.byte()).collect();
             read(&bytes);
         }
     }
@@ -128,9 +130,9 @@ fn images() -> Vec<(&'static str, Vec<u8>)> {
         ("jpeg-without-tables", head(0, 0, &bare)),
         ("png", head(1, 0, &file(image::ImageFormat::Png))),
         ("rgb", head(2, 48, &rgb)),
-        ("yuyv-padded", head(5, 40, &vec![90; 40 * 8])),
-        ("nv12", head(7, 16, &vec![90; 16 * 12])),
-        ("depth", head(8, 32, &vec![3; 32 * 8])),
+        ("yuyv-padded", head(5, 40, &[90; 40 * 8])),
+        ("nv12", head(7, 16, &[90; 16 * 12])),
+        ("depth", head(8, 32, &[3; 32 * 8])),
     ]
 }
 

@@ -11,7 +11,7 @@ const MAX_RECORD_BYTES: u64 = 512 << 20;
 /// What is set aside before any byte of a record came.
 const MAX_AHEAD_BYTES: u64 = 1 << 20;
 /// Before a record: its opcode and its length.
-const HEAD_BYTES: u64 = 1 + 8;
+const HEAD_BYTES: usize = 1 + 8;
 /// Of a chunk before its compression's name: times, length, checksum, length of the name.
 const CHUNK_HEAD_BYTES: usize = 8 + 8 + 8 + 4 + 4;
 
@@ -82,10 +82,10 @@ impl<R: Read> Records<R> {
                 }
                 self.skip(chunk.n_padding)?;
             }
-            let [opcode, length @ ..] = self.array::<{ HEAD_BYTES as usize }>()?;
+            let [opcode, length @ ..] = self.array::<HEAD_BYTES>()?;
             let n_bytes = u64::from_le_bytes(length);
             if let Some(chunk) = &mut self.chunk {
-                let n_whole = n_bytes.saturating_add(HEAD_BYTES);
+                let n_whole = n_bytes.saturating_add(HEAD_BYTES as u64);
                 chunk.n_left = chunk.n_left.checked_sub(n_whole).ok_or(Broken::BeyondChunk)?;
                 let bytes = bytes_of(&mut self.input, n_bytes)?;
                 chunk.hasher.update(&[opcode]);

@@ -59,7 +59,7 @@ pub(crate) fn joint_states(bytes: &[u8]) -> Vec<Vec<f64>> {
         let mut told = Vec::new();
         for line in bytes.split(|byte| *byte == b'\n') {
             let millis = str::from_utf8(line).ok().and_then(|line| line.parse::<u32>().ok());
-            at = at + Duration::from_millis(millis.unwrap_or(1).into());
+            at += Duration::from_millis(millis.unwrap_or(1).into());
             let arrived = Arrived { at, bytes: line.to_vec(), n_dropped: 0 };
             let read = arm.take(&arrived, |bytes| decode_joints(bytes, names).map(|told| (told.head, told)));
             if let Some((stamp, state)) = read {

@@ -33,7 +33,7 @@ pub(crate) fn told(version: FciVersion, mut bytes: &[u8]) -> Vec<Vec<f64>> {
         let mut whole = datagram.to_vec();
         whole.resize(super::super::state::n_bytes(version), 0);
         for datagram in [datagram, &whole] {
-            at = at + Duration::from_millis(1);
+            at += Duration::from_millis(1);
             if let Some(numbered) = decode(version, datagram) {
                 line.take(&mut waiting, &numbered, at);
                 line.tell_mode(&numbered.state);
