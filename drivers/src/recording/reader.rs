@@ -3,11 +3,11 @@
 //! The file is read from front to back without its index, so a recording that was cut off anywhere gives every sample
 //! before the cut.
 
+use super::record::Record;
 use super::records::{Broken, Raw, Records};
 use super::topic::{JOINT_NAMES, Topic};
 use crate::wire::{Malformed, foxglove, joint_state, point_cloud};
 use crate::{BasePose, Error, Image, Sample, Source, TruthImage};
-use mcap::records::Record;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufReader, Read};
@@ -90,7 +90,7 @@ impl Recording {
         while !self.ended {
             match self.records.next() {
                 Ok(None) => self.ended = true,
-                Ok(Some(Raw { opcode, bytes })) => match mcap::parse_record(opcode, &bytes).map(Record::into_owned) {
+                Ok(Some(Raw { opcode, bytes })) => match Record::decode(opcode, &bytes) {
                     Ok(record) => {
                         if let Some(sample) = self.take(record)? {
                             self.n_samples += 1;
@@ -112,33 +112,33 @@ impl Recording {
     }
 
     /// Takes in one record; gives a sample when one is complete.
-    fn take(&mut self, record: Record<'static>) -> Result<Option<Sample>, Error> {
+    fn take(&mut self, record: Record<'_>) -> Result<Option<Sample>, Error> {
         match record {
-            Record::Schema { header, .. } => {
-                self.schemas.insert(header.id, header.name);
+            Record::Schema { id, name } => {
+                self.schemas.insert(id, name.to_owned());
             }
-            Record::Channel(channel) => {
-                if let Some(topic) = Topic::from_name(&channel.topic) {
-                    if let (Topic::Joints, Some(names)) = (&topic, channel.metadata.get(JOINT_NAMES)) {
+            Record::Channel { id, schema_id, topic: topic_name, metadata } => {
+                if let Some(topic) = Topic::from_name(topic_name) {
+                    if let (Topic::Joints, Some(names)) = (&topic, metadata.get(JOINT_NAMES)) {
                         self.joint_names = Some(names.split(',').map(str::to_owned).collect());
                     }
-                    let schema_name = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
-                    self.channels.insert(channel.id, Channel { topic, topic_name: channel.topic, schema_name });
+                    let schema_name = self.schemas.get(&schema_id).cloned().unwrap_or_default();
+                    self.channels.insert(id, Channel { topic, topic_name: topic_name.to_owned(), schema_name });
                 }
             }
-            Record::Attachment { header, data, .. } => {
-                self.attachments.insert(header.name, data.into_owned());
+            Record::Attachment { name, data } => {
+                self.attachments.insert(name.to_owned(), data.to_vec());
             }
-            Record::Message { header, data } => {
-                if let Some(channel) = self.channels.get(&header.channel_id).cloned() {
-                    return self.decode(&channel, &data).map_err(|source| Error::BrokenMessage {
+            Record::Message { channel_id, data } => {
+                if let Some(channel) = self.channels.get(&channel_id).cloned() {
+                    return self.decode(&channel, data).map_err(|source| Error::BrokenMessage {
                         path: self.path.clone(),
                         topic: channel.topic_name,
                         source,
                     });
                 }
             }
-            _ => {}
+            Record::Other => {}
         }
         Ok(None)
     }
