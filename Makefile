@@ -4,13 +4,13 @@
 # the page's npm packages) and says so; without root it prints the one line to run.
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test hil check deps web cargo packages hil-packages mujoco realsense open-ends
+.PHONY: help demo test hil check fuzz deps web cargo packages nokhwa-packages hil-packages mujoco realsense open-ends
 
 # One feature set everywhere, so that dependencies compile once.
 FEATURES := --features sim
 
-# Tests have RealSense cameras beside that, where there is a library for them: see `realsense`.
-TEST_FEATURES = $(FEATURES)$(shell [ -e .deps/realsense/made-of ] && echo ,realsense)
+# Tests have webcams by nokhwa beside that, and RealSense cameras where there is a library for them: see `realsense`.
+TEST_FEATURES = $(FEATURES),nokhwa$(shell [ -e .deps/realsense/made-of ] && echo ,realsense)
 
 # The rig that `make demo` simulates: a file of the folder rigs.
 RIG ?= static-arm
@@ -31,7 +31,7 @@ hil: cargo packages web ## Check the rig RIG=file.toml on whatever is plugged in
 	cargo build --release $(shell pkg-config --exists realsense2 2>/dev/null && echo --features realsense)
 	target/release/fieldrig doctor $(if $(filter file,$(origin RIG)),$(error say which rig: make hil RIG=file.toml),$(RIG)) --listen $(LISTEN_SECONDS)
 
-check: deps realsense open-ends ## Format, clippy, documentation, kernels, licences, open ends
+check: deps nokhwa-packages realsense open-ends ## Format, clippy, documentation, kernels, licences, open ends
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets $(TEST_FEATURES) -- -D warnings
 	cargo clippy --workspace --exclude sim --all-targets -- -D warnings
@@ -42,6 +42,11 @@ check: deps realsense open-ends ## Format, clippy, documentation, kernels, licen
 		if cargo deny fetch db >/dev/null 2>&1; then cargo deny check advisories; \
 		else echo "cargo deny: advisories skipped, their database is out of reach"; fi; \
 	else echo "cargo deny: skipped, not installed (cargo install --locked cargo-deny)"; fi
+
+# Of each target.
+SECONDS ?= 600
+fuzz: cargo ## Feed random bytes to every reader, SECONDS=600 each, all or TARGET=can (scripts/fuzz.sh)
+	scripts/fuzz.sh $(SECONDS) $(TARGET)
 
 deps: cargo packages mujoco ## Install what building and testing need
 
@@ -54,6 +59,9 @@ cargo:
 
 packages:
 	@scripts/install-packages.sh build gpu sim web
+
+nokhwa-packages: packages
+	@scripts/install-packages.sh nokhwa
 
 # Where these cannot be installed the tests in the virtual kernel are skipped with a line, unless FIELDRIG_HIL=demand.
 hil-packages: packages

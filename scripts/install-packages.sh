@@ -2,7 +2,7 @@
 # Installs the system packages that are missing, and only those, with apt; says which and why.
 # Without root it prints the one line to run and stops; where a package is there already it does nothing.
 #
-# usage: install-packages.sh GROUP...      groups: build gpu sim web realsense hil
+# usage: install-packages.sh GROUP...      groups: build gpu sim web nokhwa realsense hil
 set -eu
 
 missing=""
@@ -54,6 +54,10 @@ for group in "$@"; do
         need_command node nodejs "bundles the web page"
         need_command npm npm "fetches what the web page is made of"
         ;;
+    nokhwa)
+        # Only Linux needs it: nokhwa's V4L2 is bound anew in each build.
+        ls /usr/lib/llvm-*/lib/libclang*.so* >/dev/null 2>&1 || need libclang-dev "builds the feature nokhwa"
+        ;;
     realsense)
         need_library libusb-1.0.so.0 libusb-1.0-0 "how librealsense2 speaks to cameras"
         need_library libudev.so.1 libudev1 "how librealsense2 finds cameras"
@@ -82,7 +86,7 @@ for group in "$@"; do
         need python3-venv "holds the peers of Franka arms"
         ;;
     *)
-        echo "install-packages: unknown group $group (build, gpu, sim, web, realsense, hil)" >&2
+        echo "install-packages: unknown group $group (build, gpu, sim, web, nokhwa, realsense, hil)" >&2
         exit 2
         ;;
     esac

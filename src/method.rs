@@ -1,5 +1,9 @@
 //! Which scene model: by its name on the command line, new or out of a folder.
 
+mod kind;
+
+pub(crate) use kind::Kind;
+
 use crate::config::Train;
 use crate::exit::BadArgument;
 use crate::run_folder::{expect_model, expect_one_model};
@@ -13,36 +17,6 @@ use trainer::nerf::{NerfModel, NerfOptions};
 use trainer::splat::{CameraChoice, SplatOptions, SplatTrainer};
 use trainer::tsdf::{TsdfModel, TsdfOptions};
 use trainer::{Aligned, Keyframe, Method, Renewable};
-
-/// The scene models there are.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Kind {
-    /// 3D Gaussians.
-    Splat,
-    /// A distance field with a mesh, from depth.
-    Tsdf,
-    /// A neural field.
-    Nerf,
-}
-
-impl Kind {
-    /// All there are.
-    pub(crate) const ALL: [Self; 3] = [Self::Splat, Self::Tsdf, Self::Nerf];
-
-    /// The kind of a name.
-    pub(crate) fn named(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|kind| kind.name() == name)
-    }
-
-    /// Its name in files and on the command line.
-    pub(crate) fn name(self) -> &'static str {
-        match self {
-            Self::Splat => "splat",
-            Self::Tsdf => "tsdf",
-            Self::Nerf => "nerf",
-        }
-    }
-}
 
 /// Names of kinds for people: `splat`, `tsdf and splat`, `tsdf, nerf and splat`.
 pub(crate) fn in_words(kinds: &[Kind]) -> String {

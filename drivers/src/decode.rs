@@ -2,7 +2,9 @@
 
 use crate::{Error, Image, PixelFormat, jpeg, yuv};
 use image::error::{DecodingError, ImageFormatHint};
-use image::{DynamicImage, ImageError, ImageFormat};
+use image::{DynamicImage, ImageError, ImageFormat, ImageReader};
+use std::borrow::Cow;
+use std::io::Cursor;
 
 impl PixelFormat {
     /// Bytes of a row without padding, and how many rows of that length an image has; `None` for compressed ones.
@@ -99,19 +101,20 @@ impl Image {
     }
 
     fn decompress(&self, format: ImageFormat) -> Result<Vec<u8>, Error> {
-        let decoded = decode_whole(&self.data, Some(format))
-            .map_err(|source| Error::Undecodable { camera: self.camera.to_string(), stamp: self.stamp, source })?
-            .into_rgb8();
-        let got_px = [decoded.width(), decoded.height()];
-        if got_px != self.size_px {
-            return Err(Error::ImageSize {
-                camera: self.camera.to_string(),
-                stamp: self.stamp,
-                got_px,
-                expected_px: self.size_px,
-            });
+        let (camera, stamp) = (self.camera.to_string(), self.stamp);
+        let decode = |expected_px: [u32; 2]| {
+            let file = first_whole(&self.data, format)?;
+            // Looked at before: a few bytes can say that a picture is large, and take seconds.
+            let got_px: [u32; 2] = ImageReader::with_format(Cursor::new(&*file), format).into_dimensions()?.into();
+            let is_expected = got_px == expected_px;
+            let rgb = is_expected.then(|| image::load_from_memory_with_format(&file, format)).transpose()?;
+            Ok((got_px, rgb))
+        };
+        match decode(self.size_px) {
+            Ok((_, Some(decoded))) => Ok(decoded.into_rgb8().into_raw()),
+            Ok((got_px, None)) => Err(Error::ImageSize { camera, stamp, got_px, expected_px: self.size_px }),
+            Err(source) => Err(Error::Undecodable { camera, stamp, source }),
         }
-        Ok(decoded.into_raw())
     }
 
     pub(crate) fn wrong_kind(&self, wanted: &'static str) -> Error {
@@ -123,11 +126,15 @@ impl Image {
 /// cut off is an error, where decoders fill up with grey.
 pub(crate) fn decode_whole(bytes: &[u8], format: Option<ImageFormat>) -> Result<DynamicImage, ImageError> {
     let format = format.map_or_else(|| image::guess_format(bytes), Ok)?;
+    image::load_from_memory_with_format(&first_whole(bytes, format)?, format)
+}
+
+fn first_whole(bytes: &[u8], format: ImageFormat) -> Result<Cow<'_, [u8]>, ImageError> {
     if format != ImageFormat::Jpeg {
-        return image::load_from_memory_with_format(bytes, format);
+        return Ok(bytes.into());
     }
     let no_image = |why| ImageError::Decoding(DecodingError::new(ImageFormatHint::Exact(format), why));
-    image::load_from_memory_with_format(&jpeg::first_image(bytes).map_err(no_image)?, format)
+    jpeg::first_image(bytes).map_err(no_image)
 }
 
 #[cfg(test)]
@@ -240,6 +247,12 @@ mod tests {
         assert!(matches!(short, Err(Error::ImageLength { got_bytes: 3, expected_bytes: 6, .. })));
         let other_size = image(PixelFormat::Png, [2, 2], &png_of([2, 1], &[0; 6])).decode_rgb();
         assert!(matches!(other_size, Err(Error::ImageSize { got_px: [2, 1], .. })));
+        // Only the first bytes of a picture that would take gigabytes.
+        let mut huge = file_of(ImageFormat::Jpeg, [2, 1], &[0; 6]);
+        let frame = huge.windows(2).position(|pair| pair == [0xff, 0xc0]).expect("a frame");
+        huge[frame + 5..frame + 9].copy_from_slice(&[0x3f, 0xff, 0x3f, 0xff]);
+        let huge = image(PixelFormat::Jpeg, [2, 2], &huge).decode_rgb();
+        assert!(matches!(huge, Err(Error::ImageSize { got_px: [16_383, 16_383], .. })), "{huge:?}");
         assert!(matches!(
             image(PixelFormat::Rgb8, [1, 1], &[0; 3]).decode_depth_m(),
             Err(Error::WrongKind { wanted: "depth", .. })

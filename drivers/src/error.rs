@@ -36,6 +36,7 @@ pub enum Error {
         waited: Duration,
     },
     /// A V4L2 camera cannot be opened, or was lost for good.
+    #[cfg(target_os = "linux")]
     #[error("camera {camera:?}: {problem}")]
     V4l2 {
         /// Name in the rig file.
@@ -64,6 +65,15 @@ pub enum Error {
         camera: String,
         /// From now on.
         left: Duration,
+    },
+    /// A camera read by nokhwa cannot be opened, or was lost for good.
+    #[cfg(feature = "nokhwa")]
+    #[error("camera {camera:?}: {problem}")]
+    Nokhwa {
+        /// Name in the rig file.
+        camera: String,
+        /// What is wrong.
+        problem: Box<crate::nokhwa::Problem>,
     },
     /// A camera was lost and is looked for; asking again may find it.
     #[error("camera {camera:?}: lost for {waited:?}, looking for it")]

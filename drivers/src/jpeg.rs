@@ -52,6 +52,13 @@ pub fn first_image(buffer: &[u8]) -> Result<Cow<'_, [u8]>, NoJpeg> {
     Err(reason)
 }
 
+/// Just behind the first whole image in a buffer; `None` where there is none.
+#[cfg(feature = "nokhwa")]
+pub(crate) fn end_of_first(buffer: &[u8]) -> Option<usize> {
+    let starts = buffer.windows(2).enumerate().filter(|(_, pair)| *pair == [0xff, START_OF_IMAGE]);
+    starts.map(|(start, _)| start).find_map(|start| walk(buffer, start).ok()).map(|whole| whole.end)
+}
+
 /// Where an image lies in its buffer.
 struct Whole {
     /// Just behind its last marker.

@@ -8,9 +8,13 @@ mod decode;
 mod error;
 #[cfg(target_os = "linux")]
 pub mod franka;
+#[cfg(any(test, fuzzing))]
+pub mod hostile;
 pub mod jpeg;
 mod live;
 pub mod motion;
+#[cfg(feature = "nokhwa")]
+pub mod nokhwa;
 pub mod realsense;
 pub mod recording;
 mod sample;

@@ -12,7 +12,7 @@ pub(crate) use real::{franka_chain, udp_arm_address};
 
 pub(crate) use real::movable_arm;
 
-use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Override, Parent, Rig, ScannerDriver};
+use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, ScannerDriver};
 use anyhow::{Context, anyhow, bail};
 use drivers::recording::{About, RIG_FILE, Recorder, Recording, URDF_FILE};
 use drivers::{Error, Live, Sample, Source};
@@ -146,12 +146,8 @@ fn is_any_simulated(rig: &Rig) -> bool {
 
 /// The first device of a rig that has no driver yet.
 fn absent_device(rig: &Rig) -> Option<String> {
-    if matches!(rig.base.driver, BaseDriver::Tags | BaseDriver::Rgbd) {
-        return Some(format!("base driver {:?}", format!("{:?}", rig.base.driver).to_lowercase()));
-    }
-    let has_none = |camera: &&Camera| camera.driver == CameraDriver::Nokhwa;
-    let camera = rig.cameras.iter().find(has_none)?;
-    Some(format!("camera {:?} with driver {:?}", camera.name, format!("{:?}", camera.driver).to_lowercase()))
+    let has_none = matches!(rig.base.driver, BaseDriver::Tags | BaseDriver::Rgbd);
+    has_none.then(|| format!("base driver {:?}", format!("{:?}", rig.base.driver).to_lowercase()))
 }
 
 #[cfg(feature = "sim")]
@@ -204,12 +200,10 @@ mod tests {
 
     #[test]
     fn devices_without_a_driver_are_named_together_with_the_way_out() {
-        for (key, value, named) in
-            [("base.driver", "tags", "tags"), ("camera.wrist.driver", "nokhwa", "camera \"wrist\"")]
-        {
-            let rig = load("static-arm.toml", &[Override::new(key, value)]);
+        for driver in ["tags", "rgbd"] {
+            let rig = load("static-arm.toml", &[Override::new("base.driver", driver)]);
             let message = format!("{:#}", super::rig(rig, Devices::Real).err().expect("no such driver"));
-            assert!(message.contains(named) && message.contains("--sim"), "{message}");
+            assert!(message.contains(driver) && message.contains("--sim"), "{message}");
         }
     }
 
@@ -237,6 +231,21 @@ mod tests {
         let without_scale = [&standing[..3], &standing[5..]].concat();
         let message = refused(&without_scale);
         assert!(message.contains("camera.wrist.depth.device"), "{message}");
+    }
+
+    #[cfg(feature = "nokhwa")]
+    #[test]
+    fn what_nokhwa_cannot_do_is_told_before_it_is_asked() {
+        let of = |more: &[Override]| {
+            let driver = [("arm.driver", "none"), ("camera.wrist.driver", "nokhwa"), ("camera.wrist.parent", "base")];
+            let overrides =
+                driver.map(|(key, value)| Override::new(key, value)).into_iter().chain(more.iter().cloned());
+            let opened = super::rig(load("static-arm.toml", &overrides.collect::<Vec<_>>()), Devices::Real);
+            format!("{:#}", opened.err().expect("nothing is plugged in"))
+        };
+        assert!(of(&[]).contains("nokhwa reads no depth"), "{}", of(&[]));
+        let gain = of(&[Override::new("camera.wrist.v4l2.gain", 7_i64)]);
+        assert!(gain.contains("left to the camera"), "{gain}");
     }
 
     #[test]

@@ -1,6 +1,8 @@
 //! The devices of a rig that are not simulated.
 
-use crate::config::{ArmDriver, ArmMotion, BaseDriver, Camera, CameraDriver, Depth, Rig, ScannerDriver};
+#[cfg(target_os = "linux")]
+use crate::config::Depth;
+use crate::config::{ArmDriver, ArmMotion, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
 use anyhow::{Context, bail};
 #[cfg(target_os = "linux")]
 use drivers::can::{self, CanArm, MovableArmConfig, MovableCanArm};
@@ -8,6 +10,7 @@ use drivers::can::{self, CanArm, MovableArmConfig, MovableCanArm};
 use drivers::franka::{self, FrankaArm, MovableFrankaArm};
 use drivers::motion::{MotionConfig, MotionLimits, MovableArm};
 use drivers::udp::{UdpArm, UdpBase, UdpScanner};
+#[cfg(target_os = "linux")]
 use drivers::v4l2::{Config, Settings, V4l2Camera, V4l2Format};
 use drivers::wire::can::odrive::Endpoints;
 use drivers::{Arm, Base, Devices, RangeScanner};
@@ -20,14 +23,13 @@ const USUAL_ARM_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCAL
 /// Opens them; a rig may have none. What only a camera knew is in the rig afterwards.
 pub(super) fn open(rig: &mut Rig) -> anyhow::Result<Devices> {
     let mut devices = Devices::default();
-    for camera in rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::V4l2) {
-        let depth = camera.depth.as_ref().map(|depth| v4l2_depth(camera, depth)).transpose()?;
-        for config in std::iter::once(v4l2_color(camera)).chain(depth) {
-            devices.cameras.push(Box::new(V4l2Camera::open(config)?));
+    for camera in &mut rig.cameras {
+        match camera.driver {
+            CameraDriver::V4l2 => devices.cameras.extend(v4l2_cameras(camera)?),
+            CameraDriver::Nokhwa => devices.cameras.push(nokhwa_camera(camera)?),
+            CameraDriver::Realsense => devices.cameras.push(super::realsense::open(camera)?),
+            CameraDriver::Sim => {}
         }
-    }
-    for camera in rig.cameras.iter_mut().filter(|camera| camera.driver == CameraDriver::Realsense) {
-        devices.cameras.push(super::realsense::open(camera)?);
     }
     devices.arm = match rig.arm.driver {
         ArmDriver::None | ArmDriver::Sim => None,
@@ -185,7 +187,53 @@ pub(crate) fn udp_arm_address(rig: &Rig) -> anyhow::Result<SocketAddr> {
     }
 }
 
+/// A camera by V4L2: its color images, and those of its depth where it has that.
+#[cfg(target_os = "linux")]
+fn v4l2_cameras(camera: &Camera) -> anyhow::Result<Vec<Box<dyn drivers::Camera>>> {
+    let depth = camera.depth.as_ref().map(|depth| v4l2_depth(camera, depth)).transpose()?;
+    let configs = std::iter::once(v4l2_color(camera)).chain(depth);
+    configs.map(|config| Ok(Box::new(V4l2Camera::open(config)?) as Box<dyn drivers::Camera>)).collect()
+}
+
+#[cfg(not(target_os = "linux"))]
+fn v4l2_cameras(camera: &Camera) -> anyhow::Result<Vec<Box<dyn drivers::Camera>>> {
+    bail!("camera {:?}: V4L2 is Linux's; driver = \"nokhwa\" reads webcams elsewhere", camera.name)
+}
+
+/// A camera by nokhwa, which sets nothing but size, rate and format.
+#[cfg(feature = "nokhwa")]
+fn nokhwa_camera(camera: &Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
+    let Camera { name, v4l2, .. } = camera;
+    if v4l2.gain.is_some() || v4l2.brightness.is_some() || v4l2.white_balance_kelvin.is_some() {
+        bail!("camera {name:?}: with the driver nokhwa gain, brightness and white balance are left to the camera");
+    }
+    if camera.depth.is_some() {
+        bail!("camera {name:?}: nokhwa reads no depth");
+    }
+    let config = drivers::nokhwa::Config {
+        name: name.to_string(),
+        device: camera.device.clone(),
+        format: v4l2.format,
+        intrinsics: camera.intrinsics.clone(),
+        rate_hz: camera.rate_hz,
+        exposure_micros: camera.exposure_micros,
+        delivery: v4l2.delivery,
+        reconnect_for: Duration::from_secs_f64(v4l2.reconnect_secs),
+    };
+    Ok(Box::new(drivers::nokhwa::NokhwaCamera::open(config)?))
+}
+
+#[cfg(not(feature = "nokhwa"))]
+fn nokhwa_camera(camera: &Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
+    bail!(
+        "camera {:?}: this program was built without nokhwa: build it with `cargo build --release --features nokhwa`; on Linux \
+         driver = \"v4l2\" reads webcams",
+        camera.name
+    )
+}
+
 /// The color images of a camera.
+#[cfg(target_os = "linux")]
 fn v4l2_color(camera: &Camera) -> Config {
     Config {
         name: camera.name.to_string(),
@@ -206,6 +254,7 @@ fn v4l2_color(camera: &Camera) -> Config {
 }
 
 /// The depth images of a camera, which come from a device of their own; its exposure is left to itself.
+#[cfg(target_os = "linux")]
 fn v4l2_depth(camera: &Camera, depth: &Depth) -> anyhow::Result<Config> {
     let Some(metres_per_count) = depth.metres_per_count.filter(|_| !depth.device.is_empty()) else {
         let name = &camera.name;

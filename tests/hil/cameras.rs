@@ -11,10 +11,10 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-const WEBCAM: &str = "platform:vivid-000";
+pub(crate) const WEBCAM: &str = "platform:vivid-000";
 const GRABBER: &str = "platform:vivid-001";
 /// Controls by which vivid injects faults (`vivid-ctrls.c`): percent of the images that it drops; a pulled cable.
-const DROP_PERCENT: u32 = 0x00f0_f040;
+pub(crate) const DROP_PERCENT: u32 = 0x00f0_f040;
 const DISCONNECT: u32 = 0x00f0_f041;
 /// The next image is damaged; the next stream does not begin; the stream that runs breaks down.
 const DAMAGE: u32 = 0x00f0_f042;
@@ -29,7 +29,7 @@ const BRIGHTNESS: u32 = 0x0098_0900;
 const SETTINGS: Settings =
     Settings { exposure_micros: None, gain: Some(77), white_balance_kelvin: None, brightness: Some(99) };
 
-fn config(device: &str, size_px: [u32; 2], rate_hz: f64) -> Config {
+pub(crate) fn config(device: &str, size_px: [u32; 2], rate_hz: f64) -> Config {
     Config {
         name: "front".into(),
         device: device.into(),
@@ -50,7 +50,7 @@ fn config(device: &str, size_px: [u32; 2], rate_hz: f64) -> Config {
 }
 
 /// The node of a device now; it may have another number after a replug.
-fn node(bus: &str) -> PathBuf {
+pub(crate) fn node(bus: &str) -> PathBuf {
     v4l2::cameras().into_iter().flatten().find(|found| found.bus == bus).expect("vivid is there").node
 }
 
@@ -149,7 +149,7 @@ fn back_after(camera: &mut V4l2Camera, began: Instant) -> (Image, Duration) {
     }
 }
 
-fn drive(action: &str) {
+pub(crate) fn drive(action: &str) {
     fs::write(Path::new("/sys/bus/platform/drivers/vivid").join(action), "vivid.0").expect("vivid can be (un)bound");
 }
 

@@ -11,6 +11,8 @@ mod cameras;
 mod can;
 mod can_motion;
 mod kvaser;
+#[cfg(feature = "nokhwa")]
+mod nokhwa;
 mod qemu;
 mod wire_errors;
 
@@ -43,7 +45,7 @@ $bb poweroff -f
 /// What came on a console when all tests inside have passed.
 const PASSED: &str = "hil: exit 0";
 
-/// All tests inside take about 90 s on an idle machine.
+/// All tests inside take about two minutes on an idle machine.
 const MAX_RUN: Duration = Duration::from_secs(420);
 
 /// Two machines at once would take each other's time, and what is tested has times.

@@ -10,6 +10,8 @@ mod arm;
 #[cfg(target_os = "linux")]
 mod bus;
 mod config;
+#[cfg(all(target_os = "linux", any(test, fuzzing)))]
+pub(crate) mod hostile;
 mod interfaces;
 #[cfg(target_os = "linux")]
 mod joints;

@@ -31,6 +31,8 @@ const HEARTBEAT_MILLIS: i64 = 500;
 const EVERY_SYNC: i64 = 1;
 /// Bit of a PDO's entry 1 that switches it off.
 const PDO_OFF: i64 = 1 << 31;
+/// No joint is further from its zero, or faster, rad or rad/s: such a reading is noise.
+pub(super) const MOST_RAD: f64 = 1e4;
 
 /// What a joint does.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -179,11 +181,12 @@ impl Motor {
             }
         };
         let per_turn = self.per_turn();
-        Some(Reading {
+        let reading = Reading {
             position_rad: position * per_turn + self.config.offset_rad,
             velocity_rad_s: velocity * per_turn,
             effort_nm: torque.map(|torque| torque / per_turn),
-        })
+        };
+        (reading.position_rad.abs() <= MOST_RAD && reading.velocity_rad_s.abs() <= MOST_RAD).then_some(reading)
     }
 
     /// Waits until the motor tells where it is.

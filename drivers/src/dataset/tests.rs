@@ -342,3 +342,15 @@ fn broken_tum_lists_name_the_line() {
     std::fs::write(folder.path().join("groundtruth.txt"), "0.99 0 0 0 0 0 0 0\n1.0 0 0 0 0 0 0 1\n").unwrap();
     assert_eq!(read(folder.path()).unwrap().frames.len(), 1);
 }
+
+#[test]
+fn tum_stamps_and_poses_beyond_all_bounds_are_no_neighbours() {
+    let folder = tum_folder();
+    let put = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+    put("rgb.txt", "1.0 rgb/1.000000.png\n9223372036 rgb/1.100000.png\n");
+    put("depth.txt", "-9223372036 depth/1.015000.png\n");
+    put("groundtruth.txt", "-9223372036 0 0 0 0 0 0 1\n0.995 1e308 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n");
+    let dataset = read(folder.path()).unwrap();
+    assert_eq!((dataset.frames.len(), dataset.n_unusable), (1, 1));
+    assert!(dataset.frames[0].depth.is_none());
+}

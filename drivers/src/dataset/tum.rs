@@ -3,7 +3,7 @@
 //! Source: Sturm, Engelhard, Endres, Burgard, Cremers 2012, and the file formats on the benchmark's pages.
 
 use super::frame::size_of;
-use super::{Dataset, DatasetFrame, DepthFile, LeftOut};
+use super::{Dataset, DatasetFrame, DepthFile, FAR_M, LeftOut};
 use crate::Error;
 use kinematics::{Intrinsics, Lens, Stamp, Transform, transform};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
@@ -144,7 +144,7 @@ fn stamp_of(word: &str) -> Option<Stamp> {
 
 /// The entry nearest in time, within the allowed gap.
 fn nearest<T>(entries: &[(Stamp, T)], stamp: Stamp) -> Option<&(Stamp, T)> {
-    let gap = |entry: &(Stamp, T)| (entry.0.0 - stamp.0).abs();
+    let gap = |entry: &(Stamp, T)| entry.0.nanos_since(stamp).saturating_abs();
     let after = entries.partition_point(|entry| entry.0 < stamp);
     let candidates = &entries[after.saturating_sub(1)..entries.len().min(after + 1)];
     candidates.iter().min_by_key(|entry| gap(entry)).filter(|entry| gap(entry) <= MAX_GAP_NANOS)
@@ -166,8 +166,10 @@ impl Poses {
                 return Some(Err(wrong("expected tx ty tz qx qy qz qw")));
             };
             let rotation = Quaternion::new(qw, qx, qy, qz);
-            if !numbers.iter().all(|number| number.is_finite()) || (rotation.norm() - 1.0).abs() > 0.01 {
-                log::warn!("{}", wrong("left out: not finite, or its quaternion is not of length 1"));
+            // Written so that no number is no pose.
+            let is_near = [x, y, z].iter().all(|along| along.abs() <= FAR_M);
+            if !(is_near && (rotation.norm() - 1.0).abs() <= 0.01) {
+                log::warn!("{}", wrong("left out: not finite, too far, or its quaternion is not of length 1"));
                 return None;
             }
             let rotation = UnitQuaternion::new_normalize(rotation);
@@ -179,11 +181,12 @@ impl Poses {
     /// The pose at a stamp, between two that lie no further than the allowed gap from it.
     fn at(&self, stamp: Stamp) -> Option<Transform> {
         let after_ix = self.0.partition_point(|(other, _)| *other < stamp);
-        let after = self.0.get(after_ix).filter(|(other, _)| other.0 - stamp.0 <= MAX_GAP_NANOS)?;
+        let after = self.0.get(after_ix).filter(|(other, _)| other.nanos_since(stamp) <= MAX_GAP_NANOS)?;
         if after.0 == stamp {
             return Some(after.1);
         }
-        let before = self.0.get(after_ix.checked_sub(1)?).filter(|(other, _)| stamp.0 - other.0 <= MAX_GAP_NANOS)?;
+        let before =
+            self.0.get(after_ix.checked_sub(1)?).filter(|(other, _)| stamp.nanos_since(*other) <= MAX_GAP_NANOS)?;
         let frac = (stamp.0 - before.0.0) as f64 / (after.0.0 - before.0.0) as f64;
         Some(transform::interpolate(&before.1, &after.1, frac))
     }

@@ -1,5 +1,8 @@
 //! An arm that is read: a thread takes the robot's states, the caller gets them as joint states.
 
+#[cfg(any(test, fuzzing))]
+pub(crate) mod hostile;
+
 use super::mover::{Mover, Timed};
 use super::session::{Session, sentence};
 use super::state::{MAX_STATE_BYTES, Numbered, decode, pose};

@@ -28,6 +28,8 @@ mod statistics;
 #[cfg(test)]
 mod tests;
 
+#[cfg(any(test, fuzzing))]
+pub(crate) use arm::hostile;
 pub use arm::{ArmConfig, FrankaArm};
 pub use franka::FciVersion;
 pub use movable::MovableFrankaArm;

@@ -16,6 +16,15 @@ pub(super) struct Numbered {
     pub(super) state: RobotState,
 }
 
+/// Length of a state.
+#[cfg(any(test, fuzzing))]
+pub(super) fn n_bytes(version: FciVersion) -> usize {
+    match version {
+        FciVersion::V5 => size_of::<v5::RobotState>(),
+        FciVersion::V10 => size_of::<v10::RobotState>(),
+    }
+}
+
 /// Reads a datagram; `None` where it is none of that version, or its joints are no angles.
 pub(super) fn decode(version: FciVersion, bytes: &[u8]) -> Option<Numbered> {
     let (number, state) = match version {

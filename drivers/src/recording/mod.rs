@@ -3,6 +3,8 @@
 //! Which topic holds what, and why nothing is lost, is told in `docs/recording.md`.
 
 mod reader;
+mod record;
+mod records;
 mod topic;
 mod writer;
 

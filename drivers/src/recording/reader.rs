@@ -3,27 +3,22 @@
 //! The file is read from front to back without its index, so a recording that was cut off anywhere gives every sample
 //! before the cut.
 
+use super::record::Record;
+use super::records::{Broken, Raw, Records};
 use super::topic::{JOINT_NAMES, Topic};
 use crate::wire::{Malformed, foxglove, joint_state, point_cloud};
 use crate::{BasePose, Error, Image, Sample, Source, TruthImage};
-use mcap::McapError;
-use mcap::records::Record;
-use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Longer records than this are taken for damage; the largest real one is a chunk with one image in it.
-const MAX_RECORD_BYTES: usize = 512 << 20;
-
 /// A recording being replayed: a [`Source`] with the samples in the order in which they were recorded.
 #[derive(Debug)]
 pub struct Recording {
     path: PathBuf,
-    file: BufReader<File>,
-    reader: Reader,
+    records: Records<BufReader<File>>,
     schemas: BTreeMap<u16, String>,
     channels: BTreeMap<u16, Channel>,
     attachments: BTreeMap<String, Vec<u8>>,
@@ -44,14 +39,6 @@ struct Channel {
     schema_name: String,
 }
 
-struct Reader(LinearReader);
-
-impl std::fmt::Debug for Reader {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str("Reader")
-    }
-}
-
 impl Recording {
     /// Opens a recording; fails when there is none, when it is no MCAP file, and when it holds no sample of ours.
     pub fn open(path: &Path) -> Result<Self, Error> {
@@ -63,14 +50,9 @@ impl Recording {
             Err(e) if e.kind() != std::io::ErrorKind::UnexpectedEof => return Err(open(e)),
             _ => return Err(Error::NotARecording { path: path.to_owned() }),
         }
-        let options = LinearReaderOptions::default()
-            .with_skip_start_magic(true)
-            .with_validate_chunk_crcs(true)
-            .with_record_length_limit(MAX_RECORD_BYTES);
         let mut recording = Self {
             path: path.to_owned(),
-            file: BufReader::with_capacity(1 << 20, file),
-            reader: Reader(LinearReader::new_with_options(options)),
+            records: Records::new(BufReader::with_capacity(1 << 20, file)),
             schemas: BTreeMap::new(),
             channels: BTreeMap::new(),
             attachments: BTreeMap::new(),
@@ -106,67 +88,57 @@ impl Recording {
 
     fn read_sample(&mut self) -> Result<Option<Sample>, Error> {
         while !self.ended {
-            match self.reader.0.next_event() {
-                None => self.ended = true,
-                Some(Ok(LinearReadEvent::ReadRequest(n_bytes))) => {
-                    let read = self.file.read(self.reader.0.insert(n_bytes));
-                    let n_bytes = read.map_err(|source| Error::Replay { path: self.path.clone(), source })?;
-                    self.reader.0.notify_read(n_bytes);
-                }
-                Some(Ok(LinearReadEvent::Record { data, opcode })) => {
-                    match mcap::parse_record(opcode, data).map(Record::into_owned) {
-                        Ok(record) => {
-                            if let Some(sample) = self.take(record)? {
-                                self.n_samples += 1;
-                                return Ok(Some(sample));
-                            }
+            match self.records.next() {
+                Ok(None) => self.ended = true,
+                Ok(Some(Raw { opcode, bytes })) => match Record::decode(opcode, &bytes) {
+                    Ok(record) => {
+                        if let Some(sample) = self.take(record)? {
+                            self.n_samples += 1;
+                            return Ok(Some(sample));
                         }
-                        Err(e) => self.end_damaged(&e),
                     }
-                }
-                Some(Err(e)) => self.end_damaged(&e),
+                    Err(error) => self.end_damaged(&format!("is damaged ({error})")),
+                },
+                Err(Broken::Read(source)) => return Err(Error::Replay { path: self.path.clone(), source }),
+                Err(broken) => self.end_damaged(&broken.to_string()),
             }
         }
         Ok(None)
     }
 
-    fn end_damaged(&mut self, error: &McapError) {
+    fn end_damaged(&mut self, how: &str) {
         self.ended = true;
-        let how = match error {
-            McapError::UnexpectedEof | McapError::UnexpectedEoc => "is cut off".to_owned(),
-            other => format!("is damaged ({other})"),
-        };
         self.damage = Some(format!("the recording {:?} {how} after {} readable samples", self.path, self.n_samples));
     }
 
     /// Takes in one record; gives a sample when one is complete.
-    fn take(&mut self, record: Record<'static>) -> Result<Option<Sample>, Error> {
+    fn take(&mut self, record: Record<'_>) -> Result<Option<Sample>, Error> {
         match record {
-            Record::Schema { header, .. } => {
-                self.schemas.insert(header.id, header.name);
+            Record::Schema { id, name } => {
+                self.schemas.insert(id, name.to_owned());
             }
-            Record::Channel(channel) => {
-                if let Some(topic) = Topic::from_name(&channel.topic) {
-                    if let (Topic::Joints, Some(names)) = (&topic, channel.metadata.get(JOINT_NAMES)) {
+            Record::Channel { id, schema_id, topic: topic_name, metadata } => {
+                if let Some(topic) = Topic::from_name(topic_name) {
+                    if let (Topic::Joints, Some(names)) = (&topic, metadata.get(JOINT_NAMES)) {
                         self.joint_names = Some(names.split(',').map(str::to_owned).collect());
                     }
-                    let schema_name = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
-                    self.channels.insert(channel.id, Channel { topic, topic_name: channel.topic, schema_name });
+                    let schema_name = self.schemas.get(&schema_id).cloned().unwrap_or_default();
+                    self.channels.insert(id, Channel { topic, topic_name: topic_name.to_owned(), schema_name });
                 }
             }
-            Record::Attachment { header, data, .. } => {
-                self.attachments.insert(header.name, data.into_owned());
+            Record::Attachment { name, data } => {
+                self.attachments.insert(name.to_owned(), data.to_vec());
             }
-            Record::Message { header, data } => {
-                if let Some(channel) = self.channels.get(&header.channel_id).cloned() {
-                    return self.decode(&channel, &data).map_err(|source| Error::BrokenMessage {
+            Record::Message { channel_id, data } => {
+                if let Some(channel) = self.channels.get(&channel_id).cloned() {
+                    return self.decode(&channel, data).map_err(|source| Error::BrokenMessage {
                         path: self.path.clone(),
                         topic: channel.topic_name,
                         source,
                     });
                 }
             }
-            _ => {}
+            Record::Other => {}
         }
         Ok(None)
     }

@@ -3,6 +3,8 @@
 mod arm;
 mod base;
 mod counts;
+#[cfg(any(test, fuzzing))]
+pub(crate) mod hostile;
 pub(crate) mod order;
 mod receiver;
 mod scanner;

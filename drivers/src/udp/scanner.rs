@@ -22,7 +22,7 @@ pub struct UdpScanner {
     counts: Counts,
     /// The turn whose parts are coming.
     turn: Option<Turn>,
-    done: VecDeque<RangeScan>,
+    pub(super) done: VecDeque<RangeScan>,
 }
 
 #[derive(Debug)]
@@ -56,7 +56,14 @@ impl UdpScanner {
         self.counts
     }
 
-    fn take(&mut self, arrived: &Arrived) {
+    /// As if nothing had come yet.
+    #[cfg(any(test, fuzzing))]
+    pub(super) fn forget(&mut self) {
+        (self.order, self.turn) = (Order::default(), None);
+        self.done.clear();
+    }
+
+    pub(super) fn take(&mut self, arrived: &Arrived) {
         self.counts.n_received += 1;
         let device = self.receiver.device();
         tell(device, &mut self.counts.n_dropped, arrived.n_dropped, "datagrams gave way to newer ones");

@@ -16,7 +16,7 @@ pub(super) struct WholeReadings {
     /// What they are called in messages.
     plural: &'static str,
     receiver: Receiver,
-    order: Order,
+    pub(super) order: Order,
     counts: Counts,
 }
 
@@ -55,7 +55,7 @@ impl WholeReadings {
         Ok(None)
     }
 
-    fn take<T>(
+    pub(super) fn take<T>(
         &mut self,
         arrived: &Arrived,
         decode: impl Fn(&[u8]) -> Result<(Head, T), Malformed>,

@@ -1,8 +1,9 @@
 //! Which V4L2 devices are plugged in, by names that stay the same from boot to boot.
 
 use super::Problem;
+use super::V4l2Format;
 use super::device::Device;
-use super::format::{self, Mode, Rates, Sizes, V4l2Format};
+use super::format::{self, Mode, Rates, Sizes};
 use std::path::{Path, PathBuf};
 
 /// One node of a V4L2 device that gives images.

@@ -3,9 +3,9 @@
 use super::abi::{FIELD_ANY, FIELD_NONE, PixFormat};
 use super::controls::{self, Applied};
 use super::device::{Device, Filled, Refused, Stream};
-use super::format::{self, Mode, V4l2Format};
+use super::format::{self, Mode};
 use super::sequence::Sequence;
-use super::{Config, Delivery, Problem, find};
+use super::{Config, Delivery, Problem, V4l2Format, find};
 use crate::{Error, Image, PixelFormat, V4l2Colors, clock};
 use kinematics::Stamp;
 use rustix::io::Errno;

@@ -21,7 +21,13 @@ pub(super) fn splats(header: &Header, bytes: &[u8]) -> Result<SplatArrays, Strin
     let bounds = Bounds::of(&chunks)?;
     let packed = vertices.columns(["packed_position", "packed_rotation", "packed_scale", "packed_color"])?;
     let (sh_degree, rest) = match header.has_element("sh") {
-        true => rest_columns(&header.table("sh", bytes)?)?,
+        true => {
+            let sh = header.table("sh", bytes)?;
+            if sh.n_rows() != vertices.n_rows() {
+                return Err(format!("colours of {} splats for {} of them", sh.n_rows(), vertices.n_rows()));
+            }
+            rest_columns(&sh)?
+        }
         false => (0, Vec::new()),
     };
     let mut splats = SplatArrays { sh_degree, ..SplatArrays::default() };

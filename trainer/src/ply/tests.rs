@@ -95,3 +95,12 @@ fn packed_files_of_another_program_are_read() {
     let norms = guitar.rotations_wxyz.iter().map(|wxyz| wxyz.iter().map(|part| part * part).sum::<f32>());
     assert!(norms.into_iter().all(|norm| (norm - 1.0).abs() < 1e-5));
 }
+
+#[test]
+fn a_packed_file_with_colours_of_fewer_splats_is_refused() {
+    let seed =
+        |name: &str| std::fs::read(format!("{}/../fuzz/seeds/model/{name}", env!("CARGO_MANIFEST_DIR"))).unwrap();
+    assert_eq!(from_bytes(&seed("ply-packed")[1..]).unwrap().n_splats(), 2);
+    let refused = from_bytes(&seed("ply-packed-colours-missing")[1..]).unwrap_err();
+    assert_eq!(refused, "colours of 1 splats for 2 of them");
+}

@@ -17,6 +17,8 @@ mod state;
 
 pub use limits::Limits;
 pub use server::PlayedRobot;
+#[cfg(any(test, fuzzing))]
+pub(crate) use server::hostile;
 
 use super::N_JOINTS;
 use franka::FciVersion;

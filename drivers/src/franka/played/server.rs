@@ -1,5 +1,8 @@
 //! The sockets of a played robot, and the thread that moves bytes between them and the robot a thousand times a second.
 
+#[cfg(any(test, fuzzing))]
+pub(crate) mod hostile;
+
 use super::super::{N_JOINTS, realtime};
 use super::message::{Command, Reply, Request};
 use super::robot::Robot;

@@ -1,0 +1,337 @@
+//! Frames from anyone, through every codec and to a motor of each family.
+
+use super::ROBSTRIDE_HOST;
+use super::config::{Family, MotorConfig};
+use super::motor::{MOST_RAD, Motor};
+use super::played::Played;
+use crate::hostile::take;
+use crate::wire::can::mit::{Command, Limits, Motion};
+use crate::wire::can::tmotor::Thermometer;
+use crate::wire::can::{Frame, Id, canopen, cia402, damiao, odrive, robstride, tmotor};
+use kinematics::Stamp;
+use std::time::Duration;
+
+/// What the counts of motors cover here.
+pub(crate) const LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
+/// Payloads of FD frames by the upper half of their codes.
+const FD_LENGTHS: [usize; 7] = [12, 16, 20, 24, 32, 48, 64];
+
+/// A motor of each family, each on a bus of its own.
+pub(crate) fn motors() -> Vec<MotorConfig> {
+    let families = [
+        Family::Damiao { motor: 1, feedback: 0x11 },
+        Family::Robstride { motor: 2, model: robstride::Model::Rs02 },
+        Family::TMotor { motor: 3, model: tmotor::Model::Ak80x9 },
+        Family::Odrive { node: odrive::Node::new(4).expect("below 64") },
+        Family::Cia402 {
+            node: canopen::Node::new(5).expect("below 128"),
+            units: cia402::Units { counts_per_turn: 4096.0, rated_torque_nm: 2.0 },
+        },
+    ];
+    let motor = |(ix, family): (usize, Family)| MotorConfig {
+        joint: format!("joint{ix}"),
+        bus_ix: ix,
+        family,
+        gear_ratio: 2.0,
+        is_reversed: ix % 2 == 1,
+        offset_rad: 0.25,
+        gains: None,
+    };
+    families.into_iter().enumerate().map(motor).collect()
+}
+
+/// Frames one behind the other: a byte of length (codes of FD) and kind, four of the identifier, little-endian, then the payload.
+pub(crate) fn decode_frames(mut bytes: &[u8]) -> Vec<Frame> {
+    let mut frames = Vec::new();
+    while !bytes.is_empty() {
+        let [head] = take(&mut bytes);
+        let number = u32::from_le_bytes(take(&mut bytes));
+        let code = usize::from(head & 0xF);
+        let is_fd = head & 0x40 != 0;
+        let n_bytes = if is_fd && code > 8 { FD_LENGTHS[code - 9] } else { code.min(8) };
+        let id = if head & 0x10 != 0 { Id::extended(number & 0x1FFF_FFFF) } else { Id::standard(number & 0x7FF) };
+        let id = id.expect("masked");
+        let is_remote = head & 0x20 != 0 && !is_fd;
+        let payload = &take::<64>(&mut &bytes[..bytes.len().min(n_bytes)])[..n_bytes];
+        let frame = match is_remote {
+            true => Frame::remote(id, n_bytes),
+            false if is_fd => Frame::fd(id, payload, head & 0x80 != 0),
+            false => Frame::classic(id, payload),
+        };
+        bytes = if is_remote { bytes } else { &bytes[bytes.len().min(n_bytes)..] };
+        frames.push(frame.expect("a length of its format"));
+    }
+    frames
+}
+
+/// Frames as [`decode_frames`] takes them.
+#[cfg(test)]
+pub(crate) fn encode_frames(frames: &[Frame]) -> Vec<u8> {
+    let encode = |frame: &Frame| {
+        let n = frame.n_bytes();
+        let code = if n <= 8 { n } else { 9 + FD_LENGTHS.iter().position(|len| *len == n).expect("an FD length") };
+        let flag = |is: bool, bit: u8| if is { bit } else { 0 };
+        let head = u8::try_from(code).expect("small")
+            | flag(frame.id().is_extended(), 0x10)
+            | flag(frame.is_remote(), 0x20)
+            | flag(frame.is_fd(), 0x40)
+            | flag(frame.is_switched(), 0x80);
+        [&[head][..], &frame.id().value().to_le_bytes(), frame.data()].concat()
+    };
+    frames.iter().flat_map(encode).collect()
+}
+
+/// Frames as [`decode_frames`] takes them, a millisecond apart: no codec panics, no motor tells of motions that there cannot be,
+/// whatever played motors send is read, and their shafts are somewhere.
+pub fn frames(bytes: &[u8]) {
+    let configs = motors();
+    let heard: Vec<_> = configs.iter().map(|config| Motor::with_limits(config.clone(), LIMITS)).collect();
+    let mut played: Vec<_> = configs.iter().map(|config| Played::new(config.family, LIMITS)).collect();
+    let mut at = Stamp(0);
+    for frame in decode_frames(bytes) {
+        codecs(&frame);
+        at += Duration::from_millis(1);
+        for (ix, played) in played.iter_mut().enumerate() {
+            check(&heard[ix], &frame);
+            let answers = played.take(&frame).unwrap_or_default();
+            for sent in answers.into_iter().chain(played.report(at).unwrap_or_default()) {
+                check(&heard[ix], &sent);
+            }
+            let Motion { position_rad, velocity_rad_s, torque_nm } = played.motion();
+            assert!([position_rad, velocity_rad_s, torque_nm].iter().all(|number| number.is_finite()), "{played:?}");
+        }
+    }
+}
+
+/// A reading is within what the motor's counts cover, and within what joints do.
+fn check(motor: &Motor, frame: &Frame) {
+    let Some(reading) = motor.read(frame) else { return };
+    let config = motor.config();
+    let limits = match config.family {
+        Family::Damiao { .. } => LIMITS,
+        Family::Robstride { model, .. } => model.limits(),
+        Family::TMotor { model, .. } => model.limits(),
+        Family::Odrive { .. } | Family::Cia402 { .. } => Limits::of(f64::INFINITY, f64::INFINITY, f64::INFINITY),
+    };
+    let most_rad = (limits.position_rad / config.gear_ratio + config.offset_rad.abs()).min(MOST_RAD);
+    let most_rad_s = (limits.velocity_rad_s / config.gear_ratio).min(MOST_RAD);
+    let most_nm = limits.torque_nm * config.gear_ratio;
+    assert!(reading.position_rad.abs() <= most_rad + 1e-9, "{frame:?}: {reading:?}");
+    assert!(reading.velocity_rad_s.abs() <= most_rad_s + 1e-9, "{frame:?}: {reading:?}");
+    assert!(reading.effort_nm.is_none_or(|nm| nm.abs() <= most_nm + 1e-9), "{frame:?}: {reading:?}");
+}
+
+/// Every codec on one frame; what it reads is not looked at here.
+fn codecs(frame: &Frame) {
+    let _ = canopen::decode_heartbeat(frame);
+    if let Err(error) = canopen::decode_sdo(frame) {
+        let _ = error.to_string();
+    }
+    let _ = damiao::decode_register(frame);
+    let _ = damiao::decode_feedback(frame, &LIMITS);
+    let _ = robstride::decode_answer(frame, ROBSTRIDE_HOST, &LIMITS);
+    for thermometer in [Thermometer::Less40, Thermometer::Plain] {
+        let _ = tmotor::decode_feedback(frame, &LIMITS, thermometer);
+    }
+    let _ = odrive::decode_answer(frame);
+    let mut data = frame.data();
+    let number = u32::from_le_bytes(take(&mut data));
+    if let Ok(object) = canopen::Object::from_mapped(number) {
+        assert_eq!(object.mapped(), number);
+    }
+    if let Ok(state) = cia402::State::from_statusword((number & 0xFFFF) as u16) {
+        let _ = state.order_to_enable(number >> 16 != 0).map(|order| state.after(order));
+    }
+    let reals: [f32; 5] = std::array::from_fn(|_| f32::from_le_bytes(take(&mut data)));
+    let _ = damiao::limits_from_registers(reals[0], reals[1], reals[2]);
+    let [position_rad, velocity_rad_s, kp_nm_rad, kd_nm_s_rad, torque_nm] = reals.map(f64::from);
+    let command = Command { position_rad, velocity_rad_s, kp_nm_rad, kd_nm_s_rad, torque_nm };
+    if let Ok(sent) = damiao::encode_command(1, &command, &LIMITS) {
+        assert_eq!(sent.data().len(), 8);
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use crate::can::motor::Reading;
+    use crate::can::played::State;
+    use crate::hostile::Random;
+
+    /// What is said on all buses while an arm is set up and read for some cycles.
+    pub(crate) fn talk() -> Vec<Frame> {
+        said_and_told().into_iter().flat_map(|(said, _)| said).collect()
+    }
+
+    /// That, for each motor on its bus, and what it told of its joint.
+    fn said_and_told() -> Vec<(Vec<Frame>, Vec<Reading>)> {
+        motors().into_iter().map(|config| said_and_told_by(&config)).collect()
+    }
+
+    fn said_and_told_by(config: &MotorConfig) -> (Vec<Frame>, Vec<Reading>) {
+        let mut played = Played::new(config.family, LIMITS);
+        let heard = Motor::with_limits(config.clone(), LIMITS);
+        let (mut said, mut told) = (set_up(config), Vec::new());
+        for frame in said.clone() {
+            said.extend(played.take(&frame).unwrap());
+        }
+        for cycle in 0..6_u16 {
+            played.set_motion(Motion { position_rad: 0.4 * f64::from(cycle), velocity_rad_s: 0.5, torque_nm: -0.25 });
+            let mut questions: Vec<Frame> = heard.question().into_iter().collect();
+            questions.extend(heard.wants_sync().then(canopen::encode_sync));
+            if let Family::TMotor { motor, .. } = config.family {
+                // Another master commands it; here we are that master.
+                questions.push(Frame::classic(Id::standard(motor.into()).unwrap(), &[0; 8]).unwrap());
+            }
+            let mut answers: Vec<Frame> = questions.iter().flat_map(|frame| played.take(frame).unwrap()).collect();
+            answers.extend(played.report(Stamp(0) + Duration::from_millis(20) * cycle.into()).unwrap());
+            told.extend(answers.iter().filter_map(|frame| heard.read(frame)));
+            said.extend(questions);
+            said.extend(answers);
+        }
+        (said, told)
+    }
+
+    /// What the driver says so that a motor reports.
+    fn set_up(config: &MotorConfig) -> Vec<Frame> {
+        match config.family {
+            Family::Damiao { motor, .. } => {
+                let read = |register| damiao::RegisterMessage { motor, access: damiao::Access::Read(register) };
+                let messages = [damiao::Register::PositionLimit, damiao::Register::Timeout].map(read);
+                messages.iter().map(|message| damiao::encode_register(message, None).unwrap()).collect()
+            }
+            Family::Robstride { motor, .. } => {
+                let report = robstride::Request::ReportActively(true);
+                vec![robstride::encode_request(ROBSTRIDE_HOST, motor, &report, &LIMITS).unwrap()]
+            }
+            Family::Cia402 { node, .. } => {
+                let (pdo, way) = (canopen::Pdo::First, canopen::Direction::Transmit);
+                let objects = [
+                    (pdo.mapping(way, 1), cia402::POSITION.mapped().into()),
+                    (pdo.mapping(way, 2), cia402::VELOCITY.mapped().into()),
+                    (pdo.mapping(way, 0), 2),
+                    (pdo.communication(way, 2), 1),
+                    (pdo.communication(way, 1), i64::from(pdo.id(way, node).value())),
+                ];
+                let objects = objects.map(|(object, value)| canopen::encode_write(node, object, value).unwrap());
+                objects.into_iter().chain([canopen::encode_nmt(canopen::Nmt::Start, Some(node))]).collect()
+            }
+            Family::TMotor { .. } | Family::Odrive { .. } => Vec::new(),
+        }
+    }
+
+    #[test]
+    fn frames_cut_doubled_or_out_of_order_move_no_joint() {
+        let mut random = Random(1);
+        for (config, (said, told)) in motors().into_iter().zip(said_and_told()) {
+            let motor = Motor::with_limits(config, LIMITS);
+            assert!(told.len() >= 5, "{motor:?} tells");
+            let read = |frames: &[Frame]| {
+                let readings: Vec<Reading> = frames.iter().filter_map(|frame| motor.read(frame)).collect();
+                assert!(readings.iter().all(|reading| told.contains(reading)), "{motor:?}: {readings:?}");
+                readings.len()
+            };
+            let doubled: Vec<Frame> = said.iter().flat_map(|frame| [*frame; 2]).collect();
+            assert_eq!((read(&said), read(&doubled)), (told.len(), 2 * told.len()));
+            for _ in 0..20 {
+                let mut shuffled = said.clone();
+                random.shuffle(&mut shuffled);
+                assert_eq!(read(&shuffled), told.len());
+            }
+            for frame in &said {
+                let bytes = [frame.data(), frame.data()].concat();
+                let cut = (0..frame.data().len()).map(|n| Frame::classic(frame.id(), &bytes[..n]).unwrap());
+                read(&cut.collect::<Vec<_>>());
+                if bytes.len() == 16 {
+                    assert_eq!(read(&[Frame::fd(frame.id(), &bytes, true).unwrap()]), 0, "two in one frame are none");
+                }
+            }
+        }
+    }
+
+    /// A command to go elsewhere, stiffly; none switches a motor on.
+    fn command(config: &MotorConfig) -> Frame {
+        let elsewhere = Command { position_rad: 1.0, kp_nm_rad: 200.0, kd_nm_s_rad: 2.0, ..Command::default() };
+        match config.family {
+            Family::Damiao { motor, .. } => damiao::encode_command(motor, &elsewhere, &LIMITS),
+            Family::Robstride { motor, model } => {
+                robstride::encode_request(ROBSTRIDE_HOST, motor, &robstride::Request::Move(elsewhere), &model.limits())
+            }
+            Family::TMotor { motor, model } => tmotor::encode_command(motor, &elsewhere, &model.limits()),
+            Family::Odrive { node } => {
+                let request = odrive::Request::SetPosition { position_rad: 1.0, velocity_rad_s: 0.0, torque_nm: 0.0 };
+                odrive::encode_request(node, &request)
+            }
+            Family::Cia402 { node, .. } => {
+                let id = canopen::Pdo::First.id(canopen::Direction::Receive, node);
+                Frame::classic(id, &[0, 0, 0, 4, 0, 0])
+            }
+        }
+        .unwrap()
+    }
+
+    /// Where a shaft is that began at 0, after frames a millisecond apart and a tenth of a second more.
+    fn shaft_after(config: &MotorConfig, frames: &[Frame]) -> (f64, State) {
+        let mut played = Played::new(config.family, LIMITS);
+        for millis in 0..100 + frames.len() {
+            let at = Stamp(0) + Duration::from_millis(millis as u64);
+            played.report(at).unwrap();
+            if let Some(frame) = frames.get(millis) {
+                // What it cannot read it does not obey.
+                let _ = played.take(frame);
+            }
+        }
+        (played.motion().position_rad, played.state())
+    }
+
+    #[test]
+    fn no_motor_that_was_not_switched_on_moves_whatever_comes() {
+        let mut random = Random(6);
+        for config in motors() {
+            let mut frames = set_up(&config);
+            frames.extend([command(&config); 20]);
+            for _ in 0..20 {
+                let mut spoilt = frames.clone();
+                random.shuffle(&mut spoilt);
+                for frame in spoilt.iter_mut().filter(|frame| !frame.is_fd() && frame.data().len() > 1).step_by(3) {
+                    *frame = Frame::classic(frame.id(), &frame.data()[..frame.data().len() - 1]).unwrap();
+                }
+                assert_eq!(shaft_after(&config, &frames), (0.0, State::Free), "{config:?}");
+                assert_eq!(shaft_after(&config, &spoilt), (0.0, State::Free), "{config:?}");
+            }
+        }
+        let damiao = &motors()[0];
+        let mit_mode = damiao::Access::Write(damiao::Register::ControlMode, damiao::Value::Whole(1));
+        let mit_mode = damiao::RegisterMessage { motor: 1, access: mit_mode };
+        let on = [
+            damiao::encode_register(&mit_mode, None).unwrap(),
+            damiao::encode_order(1, damiao::Order::Enable).unwrap(),
+            command(damiao),
+        ];
+        let (position_rad, state) = shaft_after(damiao, &on);
+        assert!(position_rad > 0.1 && state == State::Obeys, "once it is on it does: {position_rad} rad, {state:?}");
+    }
+
+    #[test]
+    fn a_motion_that_no_joint_makes_is_no_reading() {
+        let config = motors().remove(3);
+        let Family::Odrive { node } = config.family else { panic!("the fourth is an ODrive") };
+        let motor = Motor::with_limits(config, LIMITS);
+        let told = |position_rad, velocity_rad_s| {
+            motor.read(&odrive::encode_answer(node, &odrive::Answer::Motion { position_rad, velocity_rad_s }).unwrap())
+        };
+        assert!(told(3.0, 1.0).is_some());
+        assert_eq!(told(1e30, 1.0), None);
+        assert_eq!(told(3.0, -1e30), None);
+    }
+
+    #[test]
+    fn frames_come_back_from_their_bytes() {
+        let said = talk();
+        assert_eq!(decode_frames(&encode_frames(&said)), said);
+        let id = Id::extended(0x1234).unwrap();
+        let others =
+            [Frame::remote(id, 5).unwrap(), Frame::fd(id, &[7; 48], true).unwrap(), Frame::fd(id, &[], false).unwrap()];
+        assert_eq!(decode_frames(&encode_frames(&others)), others);
+    }
+}

@@ -1,0 +1,219 @@
+//! Messages and motion commands from anyone, to a played robot.
+
+use super::super::{Joints, Limits, Owner, RobotConfig, Wanted};
+use super::{Client, N_JOINTS, Robot, Server};
+use crate::hostile::take;
+use franka::FciVersion;
+use kinematics::{Chain, Stamp, Transform};
+use std::io::{ErrorKind, Read, Write};
+use std::net::{Ipv4Addr, TcpListener, TcpStream, UdpSocket};
+use std::sync::{Arc, LazyLock};
+use std::time::Duration;
+
+static CHAIN: LazyLock<Chain> = LazyLock::new(|| {
+    let urdf = include_str!("../../../../../kinematics/tests/data/panda.urdf");
+    Chain::from_urdf(urdf, "link0", "link8").expect("a robot's description")
+});
+const REST_RAD: [f64; N_JOINTS] = [0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7];
+/// Number of the first state.
+pub(crate) const FIRST: u64 = 1_000_000;
+/// So many milliseconds may pass in all where nothing is sent: a step takes 0.1 ms.
+const MAX_STEPS: u16 = 500;
+
+/// What a client does, one record behind the other: a byte that says what, a length in two, little-endian, and as many bytes.
+///
+/// Kind 0 goes over TCP, kind 1 is a motion command over UDP, of kind 2 the length is how many milliseconds pass. Wherever the
+/// joints are wanted, they got there within their limits.
+pub fn client(bytes: &[u8]) {
+    for version in [FciVersion::V5, FciVersion::V10] {
+        wanted(version, bytes);
+    }
+}
+
+/// Where the joints are wanted after that, see [`client`]; at first they rest at angles of their own.
+pub(crate) fn wanted(version: FciVersion, mut bytes: &[u8]) -> (Wanted, Wanted) {
+    let limits = if version == FciVersion::V5 { Limits::panda() } else { Limits::fr3() };
+    let mut server = server(version, limits.clone());
+    let first = server.robot.wanted;
+    let Some((mut stream, commands)) = connect(&mut server) else { return (first, first) };
+    let (mut number, mut n_left) = (FIRST, MAX_STEPS);
+    while !bytes.is_empty() {
+        let [kind] = take(&mut bytes);
+        let length = u16::from_le_bytes(take(&mut bytes));
+        let mut n_steps = 1;
+        if kind % 3 == 2 {
+            n_steps = length.min(n_left);
+            n_left -= n_steps;
+        } else {
+            let (sent, rest) = bytes.split_at(bytes.len().min(length.into()));
+            bytes = rest;
+            // A server that has hung up, or will not have more, is what a client has to live with.
+            let _ = match kind % 3 {
+                0 => stream.write(sent),
+                _ => commands.send(sent),
+            };
+        }
+        for _ in 0..n_steps {
+            let before = server.robot.wanted;
+            server.step(Stamp(0), number, true);
+            number += 1;
+            check(&limits, &before, &server.robot.wanted);
+            hear(&mut stream);
+        }
+    }
+    (first, server.robot.wanted)
+}
+
+/// A robot whose joints are where they are wanted.
+fn server(version: FciVersion, limits: Limits) -> Server {
+    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port");
+    let states = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port");
+    listener.set_nonblocking(true).and_then(|()| states.set_nonblocking(true)).expect("an open socket");
+    let address = listener.local_addr().expect("an open socket");
+    let config = RobotConfig { address, version, chain: CHAIN.clone(), flange_from_ee: Transform::identity(), limits };
+    let owner: Owner = Box::new(|_, wanted: &Wanted| Joints {
+        position_rad: wanted.position_rad,
+        velocity_rad_s: wanted.velocity_rad_s,
+        ..Joints::default()
+    });
+    let robot = Robot::new(config, Joints { position_rad: REST_RAD, ..Joints::default() });
+    Server { listener, states, robot, owner, client: None, stop: Arc::default() }
+}
+
+/// A client that the server has taken, and its socket for commands.
+fn connect(server: &mut Server) -> Option<(TcpStream, UdpSocket)> {
+    let stream = TcpStream::connect(server.listener.local_addr().ok()?).ok()?;
+    stream.set_nonblocking(true).ok()?;
+    let commands = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).ok()?;
+    commands.connect(server.states.local_addr().ok()?).ok()?;
+    for _ in 0..100 {
+        server.welcome();
+        if let Some(Client { .. }) = server.client {
+            return Some((stream, commands));
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    None
+}
+
+/// Takes what the server sent, so that its answers find room.
+fn hear(stream: &mut TcpStream) {
+    let mut buffer = [0; 4096];
+    loop {
+        match stream.read(&mut buffer) {
+            Ok(n) if n == buffer.len() => {}
+            Err(error) if error.kind() == ErrorKind::Interrupted => {}
+            _ => return,
+        }
+    }
+}
+
+/// Angles are numbers, and no further on than a joint may turn in a millisecond.
+fn check(limits: &Limits, before: &Wanted, now: &Wanted) {
+    for ix in 0..N_JOINTS {
+        let turned_rad = (now.position_rad[ix] - before.position_rad[ix]).abs();
+        assert!(turned_rad <= limits.velocity_rad_s[ix] * 1e-3 + 1e-7, "joint {ix}: {before:?}, then {now:?}");
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use crate::hostile::Random;
+    use franka::wire::HeaderLayout;
+    use franka::wire::robot::{v5, v10};
+    use zerocopy::IntoBytes;
+    use zerocopy::little_endian::{F64, U64};
+
+    /// States of a robot whose joints turn a little from each to the next.
+    pub(crate) fn state_datagrams(version: FciVersion, n: u32) -> Vec<Vec<u8>> {
+        let limits = if version == FciVersion::V5 { Limits::panda() } else { Limits::fr3() };
+        let mut server = server(version, limits);
+        let state = |ix: u32| {
+            let position_rad = REST_RAD.map(|rest| rest + 0.002 * f64::from(ix));
+            server.robot.observe(Joints { position_rad, ..Joints::default() });
+            server.robot.state(FIRST + u64::from(ix))
+        };
+        (0..n).map(state).collect()
+    }
+
+    fn record(kind: u8, bytes: &[u8]) -> Vec<u8> {
+        let length = u16::try_from(bytes.len()).unwrap().to_le_bytes();
+        [&[kind], &length[..], bytes].concat()
+    }
+
+    fn message(command: u32, payload: &[u8]) -> Vec<u8> {
+        let mut bytes = HeaderLayout::Robot.encode_header(command, 1, payload.len());
+        bytes.extend(payload);
+        record(0, &bytes)
+    }
+
+    /// A client that connects, sets a threshold, moves the joints a little and says goodbye: records as [`client`] takes them.
+    pub(crate) fn talk(version: FciVersion) -> Vec<Vec<u8>> {
+        let (number, connect, collision, begin, n_begin) = match version {
+            FciVersion::V5 => (
+                5_u16,
+                v5::Command::Connect.to_u32(),
+                v5::Command::SetCollisionBehavior.to_u32(),
+                v5::Command::Move.to_u32(),
+                size_of::<v5::MoveRequest>(),
+            ),
+            FciVersion::V10 => (
+                10,
+                v10::Command::Connect.to_u32(),
+                v10::Command::SetCollisionBehavior.to_u32(),
+                v10::Command::Move.to_u32(),
+                size_of::<v10::MoveRequest>(),
+            ),
+        };
+        let mut records = vec![message(connect, &[number.to_le_bytes(), [1, 2]].concat())];
+        records.push(message(collision, &[0x40; size_of::<v10::SetCollisionBehaviorRequest>()]));
+        // Joint impedance and joint positions are the first of their kinds in both versions.
+        records.push(message(begin, &vec![0; n_begin]));
+        for step in 0..12_u32 {
+            // Within the jerk that both allow: a third of a microradian a cube of milliseconds.
+            let way_rad = 3e-7 * f64::from(step.pow(3)) / 6.0;
+            records.push(record(1, &command(version, FIRST + 2 + u64::from(step), way_rad)));
+        }
+        records.push([&[2_u8][..], &40_u16.to_le_bytes()].concat());
+        records
+    }
+
+    fn command(version: FciVersion, number: u64, way_rad: f64) -> Vec<u8> {
+        let q_c = REST_RAD.map(|rest| F64::new(rest + way_rad));
+        match version {
+            FciVersion::V5 => {
+                let mut command = v5::RobotCommand::default();
+                (command.message_id, command.motion.q_c) = (U64::new(number), q_c);
+                command.as_bytes().to_vec()
+            }
+            FciVersion::V10 => {
+                let mut command = v10::RobotCommand::default();
+                (command.message_id, command.motion.q_c) = (U64::new(number), q_c);
+                command.as_bytes().to_vec()
+            }
+        }
+    }
+
+    #[test]
+    fn only_a_client_that_begins_a_motion_moves_joints() {
+        let mut random = Random(4);
+        for version in crate::franka::hostile::tests::VERSIONS {
+            let records = talk(version);
+            let (first, last) = wanted(version, &records.concat());
+            assert_ne!(first.position_rad, last.position_rad, "the motion that is spoilt below: {version:?}");
+            // Without the record that begins the motion, in any order, cut off or doubled.
+            for round in 0..30 {
+                let mut spoilt: Vec<_> = records.iter().filter(|record| **record != records[2]).cloned().collect();
+                random.shuffle(&mut spoilt);
+                match round % 3 {
+                    0 => spoilt = spoilt.iter().flat_map(|record| [record.clone(), record.clone()]).collect(),
+                    1 => spoilt.iter_mut().for_each(|record| record.truncate(record.len() / 2)),
+                    _ => {}
+                }
+                let (first, last) = wanted(version, &spoilt.concat());
+                assert_eq!(first.position_rad, last.position_rad, "{version:?}, round {round}");
+            }
+        }
+    }
+}

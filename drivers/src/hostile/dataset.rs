@@ -1,0 +1,49 @@
+//! Lists of images and poses from anyone; the images themselves are there.
+
+use super::Scratch;
+use crate::dataset;
+use kinematics::transform;
+
+thread_local! {
+    /// Folders with a photo and a depth image, whose lists are written anew each time.
+    static NERFSTUDIO: Scratch = folder("nerfstudio");
+    static TUM: Scratch = folder("tum");
+}
+
+/// A whole `transforms.json`.
+pub fn nerfstudio(bytes: &[u8]) {
+    NERFSTUDIO.with(|folder| {
+        folder.write("transforms.json", bytes);
+        read(folder);
+    });
+}
+
+/// The lists of a TUM folder, with a line of three equals signs between them: photos, depth images, poses, lens.
+pub fn tum(bytes: &[u8]) {
+    let text = String::from_utf8_lossy(bytes);
+    let mut lists = text.splitn(4, "===\n");
+    TUM.with(|folder| {
+        for name in ["rgb.txt", "depth.txt", "groundtruth.txt", "calibration.txt"] {
+            folder.write(name, lists.next().unwrap_or_default().as_bytes());
+        }
+        read(folder);
+    });
+}
+
+fn read(folder: &Scratch) {
+    let Ok(dataset) = dataset::read(&folder.0) else { return };
+    assert!(!dataset.frames.is_empty());
+    for frame in &dataset.frames {
+        assert!(transform::is_finite(&frame.world_from_camera), "{frame:?}");
+        let _ = frame.load();
+    }
+}
+
+fn folder(name: &str) -> Scratch {
+    let folder = Scratch::new(name);
+    let photo = image::RgbImage::from_pixel(4, 3, image::Rgb([40, 60, 7]));
+    photo.save(folder.0.join("photo.png")).expect("a small picture");
+    let depth = image::ImageBuffer::<image::Luma<u16>, _>::from_pixel(4, 3, image::Luma([1000]));
+    depth.save(folder.0.join("depth.png")).expect("a small picture");
+    folder
+}

@@ -1,0 +1,218 @@
+//! The thread that calls `nokhwa`, whose calls may not come back.
+
+use super::{Config, Problem};
+use crate::v4l2::V4l2Format;
+use crate::{PixelFormat, YuvColors, YuvLayout, YuvMatrix, YuvRange, clock, jpeg};
+use kinematics::Stamp;
+use nokhwa::Camera;
+use nokhwa::utils::{
+    ApiBackend, CameraFormat, CameraIndex, CameraInfo, FrameFormat, RequestedFormat, RequestedFormatType, Resolution,
+};
+use std::collections::VecDeque;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
+
+/// Images that may wait for the caller: a quarter of a second at 30 Hz.
+const MAX_WAITING: usize = 8;
+/// What cameras mean by YUV where they do not say.
+const USUAL_COLORS: YuvColors = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited };
+/// What formats are called here and there, best first.
+const FORMATS: [(V4l2Format, FrameFormat, PixelFormat); 5] = [
+    (V4l2Format::Yuyv, FrameFormat::YUYV, PixelFormat::Yuv { layout: YuvLayout::Yuyv, colors: USUAL_COLORS }),
+    (V4l2Format::Nv12, FrameFormat::NV12, PixelFormat::Yuv { layout: YuvLayout::Nv12, colors: USUAL_COLORS }),
+    (V4l2Format::Mjpeg, FrameFormat::MJPEG, PixelFormat::Jpeg),
+    (V4l2Format::Rgb, FrameFormat::RAWRGB, PixelFormat::Rgb8),
+    (V4l2Format::Bgr, FrameFormat::RAWBGR, PixelFormat::Bgr8),
+];
+
+/// What the thread has to say.
+pub(super) enum Told {
+    /// It streams; what, for people.
+    Streams(String),
+    Frame(Frame),
+    /// The last that comes.
+    Ended(Problem),
+}
+
+/// An image as it came.
+pub(super) struct Frame {
+    pub(super) arrival: Stamp,
+    pub(super) format: PixelFormat,
+    pub(super) bytes: Vec<u8>,
+}
+
+/// A thread that streams; once this is dropped it ends as soon as its call comes back.
+#[derive(Debug)]
+pub(super) struct Worker {
+    shared: Arc<Shared>,
+}
+
+/// What lies between the thread and the caller.
+#[derive(Debug, Default)]
+struct Shared {
+    state: Mutex<State>,
+    arrived: Condvar,
+}
+
+#[derive(Default)]
+struct State {
+    queue: VecDeque<Told>,
+    /// The caller is gone.
+    stop: bool,
+}
+
+impl std::fmt::Debug for State {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("State").field("n_waiting", &self.queue.len()).field("stop", &self.stop).finish()
+    }
+}
+
+impl Worker {
+    /// Begins to open the camera, and then to stream. `alive` is held for as long as the thread lives.
+    pub(super) fn start(config: &Config, alive: Arc<()>) -> Result<Self, Problem> {
+        let shared = Arc::new(Shared::default());
+        let (config, telling) = (config.clone(), Arc::clone(&shared));
+        let thread = std::thread::Builder::new().name(format!("nokhwa {}", config.name)).spawn(move || {
+            let _alive = alive;
+            if let Err(problem) = stream(&config, &telling) {
+                telling.tell(Told::Ended(problem));
+            }
+        });
+        match thread {
+            Ok(_) => Ok(Self { shared }),
+            Err(error) => Err(Problem::Refused { wanted: "a thread".to_owned(), reason: error.to_string() }),
+        }
+    }
+
+    /// The oldest that was told and not taken; `None` when there was nothing until then.
+    pub(super) fn next(&self, until: Instant) -> Option<Told> {
+        let mut state = self.shared.lock();
+        loop {
+            if let Some(told) = state.queue.pop_front() {
+                return Some(told);
+            }
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return None;
+            }
+            state = self.shared.arrived.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+}
+
+impl Drop for Worker {
+    fn drop(&mut self) {
+        self.shared.lock().stop = true;
+    }
+}
+
+impl Shared {
+    /// The state, also after a thread panicked while it held it: the queue is never left half changed.
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The oldest image goes where there are too many: it is missed by its stamp. Whether the caller still listens.
+    fn tell(&self, told: Told) -> bool {
+        let mut state = self.lock();
+        if state.queue.len() >= MAX_WAITING {
+            state.queue.pop_front();
+        }
+        state.queue.push_back(told);
+        self.arrived.notify_all();
+        !state.stop
+    }
+}
+
+/// Streams until nobody listens; whatever goes wrong ends it.
+fn stream(config: &Config, shared: &Shared) -> Result<(), Problem> {
+    let index = find(&config.device)?;
+    let (mut camera, format) = open(config, index)?;
+    let unplugged = |error: nokhwa::NokhwaError| Problem::Unplugged { reason: error.to_string() };
+    camera.open_stream().map_err(unplugged)?;
+    let mut listens = shared.tell(Told::Streams(format!("{}, {}", camera.info().human_name(), wanted(config, format))));
+    while listens {
+        let buffer = camera.frame().map_err(unplugged)?;
+        let arrival = clock::now();
+        let bytes = trimmed(buffer.buffer(), format, config.intrinsics.size_px);
+        listens = shared.tell(Told::Frame(Frame { arrival, format: pixels(format), bytes }));
+    }
+    Ok(())
+}
+
+/// The camera of a name. Numbers change with every plug, so it is looked for each time.
+fn find(device: &str) -> Result<CameraIndex, Problem> {
+    if let Some(index) = number(device) {
+        return Ok(CameraIndex::Index(index));
+    }
+    let mut cameras = nokhwa::query(ApiBackend::Auto).unwrap_or_default();
+    // Some have several nodes: the first is the one for images.
+    cameras.sort_by_key(|camera| camera.index().as_index().unwrap_or(u32::MAX));
+    let is_it = |camera: &&CameraInfo| camera.human_name() == device;
+    let is_part = |camera: &&CameraInfo| !device.is_empty() && camera.human_name().contains(device);
+    match cameras.iter().find(is_it).or_else(|| cameras.iter().find(is_part)) {
+        Some(camera) => Ok(camera.index().clone()),
+        None => {
+            let names = cameras.iter().map(|camera| format!("{:?} ({})", camera.human_name(), camera.index()));
+            let there = names.collect::<Vec<_>>().join(", ");
+            Err(Problem::NoDevice {
+                device: device.to_owned(),
+                there: if there.is_empty() { "none".into() } else { there },
+            })
+        }
+    }
+}
+
+/// A number, or that of a node or of what a link leads to.
+fn number(device: &str) -> Option<u32> {
+    let node = std::fs::canonicalize(device).ok();
+    let node = node.as_ref().and_then(|node| node.to_str()).unwrap_or(device);
+    node.strip_prefix("/dev/video").unwrap_or(node).parse().ok()
+}
+
+/// The camera in the wanted format, or in the first that it has.
+fn open(config: &Config, index: CameraIndex) -> Result<(Camera, V4l2Format), Problem> {
+    let rate_hz = config.rate_hz;
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "compared with what it was")]
+    let whole_hz = rate_hz.round() as u32;
+    if f64::from(whole_hz) != rate_hz {
+        return Err(Problem::Rate { rate_hz });
+    }
+    let [width, height] = config.intrinsics.size_px;
+    let mut reason = None;
+    for (name, format, _) in FORMATS.iter().filter(|(name, ..)| config.format.is_none_or(|wanted| wanted == *name)) {
+        let exact = CameraFormat::new(Resolution::new(width, height), *format, whole_hz);
+        let formats = [*format];
+        let request = RequestedFormat::with_formats(RequestedFormatType::Exact(exact), &formats);
+        match Camera::new(index.clone(), request) {
+            Ok(camera) => return Ok((camera, *name)),
+            Err(error) => reason = reason.or(Some(error.to_string())),
+        }
+    }
+    match (config.format, reason) {
+        (Some(format), None) => Err(Problem::Format { format: format.name() }),
+        (format, reason) => Err(Problem::Refused {
+            wanted: format.map_or_else(|| format!("{width}x{height} at {rate_hz} Hz"), |format| wanted(config, format)),
+            reason: reason.unwrap_or_default(),
+        }),
+    }
+}
+
+fn wanted(config: &Config, format: V4l2Format) -> String {
+    let [width, height] = config.intrinsics.size_px;
+    format!("{} {width}x{height} at {} Hz", format.name(), config.rate_hz)
+}
+
+fn pixels(format: V4l2Format) -> PixelFormat {
+    let of_name = FORMATS.iter().find(|(name, ..)| *name == format);
+    of_name.expect("opened with one of them").2
+}
+
+/// An image without what lies behind it: on Linux the whole buffer comes, however short the image in it.
+fn trimmed(buffer: &[u8], format: V4l2Format, size_px: [u32; 2]) -> Vec<u8> {
+    let n_bytes = match pixels(format).raw_size(size_px) {
+        Some([row_bytes, n_rows]) => row_bytes.saturating_mul(n_rows),
+        None => jpeg::end_of_first(buffer).unwrap_or(buffer.len()),
+    };
+    buffer[..buffer.len().min(n_bytes)].to_vec()
+}

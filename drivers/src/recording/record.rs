@@ -1,0 +1,165 @@
+//! What the records of an MCAP file say that recordings are made of; no length in them is believed before its bytes are there.
+//!
+//! Source: the MCAP format specification, <https://mcap.dev/spec>, "Records".
+
+use std::collections::BTreeMap;
+
+const SCHEMA: u8 = 0x03;
+const CHANNEL: u8 = 0x04;
+const MESSAGE: u8 = 0x05;
+const ATTACHMENT: u8 = 0x09;
+
+/// A record that is read.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) enum Record<'a> {
+    Schema {
+        id: u16,
+        name: &'a str,
+    },
+    Channel {
+        id: u16,
+        schema_id: u16,
+        topic: &'a str,
+        metadata: BTreeMap<&'a str, &'a str>,
+    },
+    Message {
+        channel_id: u16,
+        data: &'a [u8],
+    },
+    Attachment {
+        name: &'a str,
+        data: &'a [u8],
+    },
+    /// Indices, statistics and whatever newer writers know.
+    Other,
+}
+
+/// What is wrong with a record.
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+pub(super) enum Wrong {
+    #[error("a record ends inside a field")]
+    CutOff,
+    #[error("a name is not UTF-8")]
+    Text,
+    #[error("the checksum of attachment {name:?} is wrong")]
+    Checksum { name: String },
+}
+
+impl<'a> Record<'a> {
+    pub(super) fn decode(opcode: u8, bytes: &'a [u8]) -> Result<Self, Wrong> {
+        let mut fields = Fields(bytes);
+        Ok(match opcode {
+            SCHEMA => Self::Schema { id: fields.two()?, name: fields.text()? },
+            CHANNEL => {
+                let (id, schema_id, topic) = (fields.two()?, fields.two()?, fields.text()?);
+                let _encoding = fields.text()?;
+                let n_bytes = fields.four()?.into();
+                let mut entries = Fields(fields.bytes(n_bytes)?);
+                let mut metadata = BTreeMap::new();
+                while !entries.0.is_empty() {
+                    metadata.insert(entries.text()?, entries.text()?);
+                }
+                Self::Channel { id, schema_id, topic, metadata }
+            }
+            MESSAGE => {
+                let channel_id = fields.two()?;
+                let _sequence = fields.four()?;
+                let _times = fields.bytes(8 + 8)?;
+                Self::Message { channel_id, data: fields.0 }
+            }
+            ATTACHMENT => {
+                let _times = fields.bytes(8 + 8)?;
+                let (name, _media_type) = (fields.text()?, fields.text()?);
+                let n_bytes = fields.eight()?;
+                let data = fields.bytes(n_bytes)?;
+                let summed = &bytes[..bytes.len() - fields.0.len()];
+                let told = fields.four()?;
+                if told != 0 && told != crc32fast::hash(summed) {
+                    return Err(Wrong::Checksum { name: name.chars().take(100).collect() });
+                }
+                Self::Attachment { name, data }
+            }
+            _ => Self::Other,
+        })
+    }
+}
+
+/// What is left of a record.
+struct Fields<'a>(&'a [u8]);
+
+impl<'a> Fields<'a> {
+    fn bytes(&mut self, n_bytes: u64) -> Result<&'a [u8], Wrong> {
+        let n_bytes = usize::try_from(n_bytes).map_err(|_| Wrong::CutOff)?;
+        let (field, rest) = self.0.split_at_checked(n_bytes).ok_or(Wrong::CutOff)?;
+        self.0 = rest;
+        Ok(field)
+    }
+
+    fn array<const N: usize>(&mut self) -> Result<[u8; N], Wrong> {
+        let (field, rest) = self.0.split_first_chunk().ok_or(Wrong::CutOff)?;
+        self.0 = rest;
+        Ok(*field)
+    }
+
+    fn two(&mut self) -> Result<u16, Wrong> {
+        self.array().map(u16::from_le_bytes)
+    }
+
+    fn four(&mut self) -> Result<u32, Wrong> {
+        self.array().map(u32::from_le_bytes)
+    }
+
+    fn eight(&mut self) -> Result<u64, Wrong> {
+        self.array().map(u64::from_le_bytes)
+    }
+
+    fn text(&mut self) -> Result<&'a str, Wrong> {
+        let n_bytes = self.four()?.into();
+        std::str::from_utf8(self.bytes(n_bytes)?).map_err(|_| Wrong::Text)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn text(text: &str) -> Vec<u8> {
+        [&u32::try_from(text.len()).expect("short").to_le_bytes()[..], text.as_bytes()].concat()
+    }
+
+    fn attachment(checksum: impl Fn(&[u8]) -> u32) -> Vec<u8> {
+        let body = [&[0; 16][..], &text("rig.toml"), &text("text/plain"), &3_u64.to_le_bytes(), b"abc"].concat();
+        [&body[..], &checksum(&body).to_le_bytes()].concat()
+    }
+
+    #[test]
+    fn records_are_read_and_cut_ones_are_not() {
+        let entries = [text("joint_names"), text("a,b")].concat();
+        let n_entries = u32::try_from(entries.len()).expect("short").to_le_bytes();
+        let channel = [&[7, 0, 3, 0][..], &text("/joints"), &text("json"), &n_entries, &entries].concat();
+        let schema = [&[3, 0][..], &text("s"), &text("jsonschema"), &text("{}")].concat();
+        let whole = attachment(crc32fast::hash);
+        let metadata = BTreeMap::from([("joint_names", "a,b")]);
+        for (opcode, bytes, expected) in [
+            (CHANNEL, &channel, Record::Channel { id: 7, schema_id: 3, topic: "/joints", metadata }),
+            (SCHEMA, &schema, Record::Schema { id: 3, name: "s" }),
+            (ATTACHMENT, &whole, Record::Attachment { name: "rig.toml", data: b"abc" }),
+        ] {
+            assert_eq!(Record::decode(opcode, bytes), Ok(expected));
+            for n_bytes in 0..7 {
+                assert_eq!(Record::decode(opcode, &bytes[..n_bytes]), Err(Wrong::CutOff), "{opcode}: {n_bytes} bytes");
+            }
+        }
+        assert_eq!(Record::decode(0x0B, &[]), Ok(Record::Other));
+        assert_eq!(Record::decode(ATTACHMENT, &attachment(|_| 0)), Record::decode(ATTACHMENT, &whole), "none is told");
+        let wrong = Record::decode(ATTACHMENT, &attachment(|_| 1));
+        assert_eq!(wrong, Err(Wrong::Checksum { name: "rig.toml".to_owned() }));
+    }
+
+    #[test]
+    fn a_length_of_gigabytes_takes_no_memory() {
+        let huge = [&[7, 0, 3, 0][..], &u32::MAX.to_le_bytes(), b"/joints"].concat();
+        assert_eq!(Record::decode(CHANNEL, &huge), Err(Wrong::CutOff));
+        assert_eq!(Record::decode(SCHEMA, &[1, 0, 1, 0, 0, 0, 0xff]), Err(Wrong::Text));
+    }
+}

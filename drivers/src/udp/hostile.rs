@@ -1,0 +1,151 @@
+//! Datagrams from anyone, to an arm, a base and a range scanner.
+
+use super::order::Order;
+use super::receiver::Arrived;
+use super::scanner::UdpScanner;
+use super::whole::WholeReadings;
+use crate::wire::datagram::{PoseDatagram, decode_joints, decode_pose};
+use kinematics::Stamp;
+use std::cell::RefCell;
+use std::time::Duration;
+
+/// When the first datagram arrives: seeds have stamps near it.
+pub(crate) const BEGAN: Stamp = Stamp(1_000_000_000_000);
+/// Nothing that is told lies further off, metres, radians or what a joint's unit is; of echoes each coordinate.
+const FAR: f64 = 1e4;
+
+/// An arm of three joints, a base, and a scanner named `lidar`, without the threads' bytes.
+struct Readers {
+    names: Vec<String>,
+    arm: WholeReadings,
+    base: WholeReadings,
+    scanner: UdpScanner,
+}
+
+thread_local! {
+    /// Ports are taken once: what is read is begun anew each time.
+    static READERS: RefCell<Readers> = RefCell::new(Readers::new());
+}
+
+impl Readers {
+    fn new() -> Self {
+        let any = "127.0.0.1:0".parse().expect("an address");
+        let open = |device, plural| WholeReadings::open(device, plural, any).expect("a free port");
+        Self {
+            names: ["a", "b", "c"].map(str::to_owned).to_vec(),
+            arm: open("arm", "joint states"),
+            base: open("base", "poses"),
+            scanner: UdpScanner::open("lidar", any).expect("a free port"),
+        }
+    }
+}
+
+/// Datagrams, one a line, a millisecond apart; a line that is a whole number lets so many milliseconds pass instead.
+///
+/// Stamps of a device grow and are of now; numbers lie within what the format allows.
+pub fn datagrams(bytes: &[u8]) {
+    joint_states(bytes);
+}
+
+/// The positions of the arm's joints that the datagrams told, see [`datagrams`].
+pub(crate) fn joint_states(bytes: &[u8]) -> Vec<Vec<f64>> {
+    READERS.with_borrow_mut(|readers| {
+        let Readers { names, arm, base, scanner } = readers;
+        arm.order = Order::default();
+        base.order = Order::default();
+        scanner.forget();
+        let mut at = BEGAN;
+        let mut newest = [None; 3];
+        let mut told = Vec::new();
+        for line in bytes.split(|byte| *byte == b'\n') {
+            let millis = str::from_utf8(line).ok().and_then(|line| line.parse::<u32>().ok());
+            at += Duration::from_millis(millis.unwrap_or(1).into());
+            let arrived = Arrived { at, bytes: line.to_vec(), n_dropped: 0 };
+            let read = arm.take(&arrived, |bytes| decode_joints(bytes, names).map(|told| (told.head, told)));
+            if let Some((stamp, state)) = read {
+                assert_grows(&mut newest[0], stamp, at);
+                assert_eq!(state.position.len(), names.len());
+                let numbers = state.position.iter().chain(&state.velocity).chain(&state.effort);
+                assert!(numbers.into_iter().all(|number| number.abs() <= FAR), "{state:?}");
+                told.push(state.position);
+            }
+            let decode =
+                |bytes: &[u8]| decode_pose(bytes).map(|PoseDatagram { head, world_from_base }| (head, world_from_base));
+            if let Some((stamp, pose)) = base.take(&arrived, decode) {
+                assert_grows(&mut newest[1], stamp, at);
+                assert!(pose.translation.vector.amax() <= FAR, "{pose:?}");
+                assert!((pose.rotation.quaternion().norm() - 1.0).abs() < 1e-9, "{pose:?}");
+            }
+            scanner.take(&arrived);
+            while let Some(scan) = scanner.done.pop_front() {
+                assert_grows(&mut newest[2], scan.stamp, at);
+                let coordinates = scan.points.iter().flat_map(|point| point.position_m);
+                assert!(coordinates.into_iter().all(|along| f64::from(along.abs()) <= FAR), "{scan:?}");
+            }
+        }
+        told
+    })
+}
+
+/// A stamp comes after the one before, and not after its arrival, but for what rounding does.
+fn assert_grows(newest: &mut Option<Stamp>, stamp: Stamp, arrival: Stamp) {
+    assert!(newest.is_none_or(|newest| stamp > newest), "{newest:?}, then {stamp:?}");
+    assert!(stamp.secs_since(arrival) <= 1e-3, "{stamp:?} arrived at {arrival:?}");
+    *newest = Some(stamp);
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use crate::RangePoint;
+    use crate::hostile::Random;
+    use crate::wire::datagram::{Clock, Head, JointsDatagram, ScanPart, encode_joints, encode_pose, encode_scan};
+    use kinematics::Transform;
+
+    /// What an arm, a base and a scanner send in 30 ms, one datagram a line.
+    pub(crate) fn talk() -> Vec<Vec<u8>> {
+        let names = ["a", "b", "c"].map(str::to_owned);
+        let mut lines = Vec::new();
+        for seq in 0..10_u32 {
+            let stamp_nanos = BEGAN.0 + i64::from(seq) * 3_000_000;
+            let head = Head { seq: seq.into(), clock: Clock::Monotonic, stamp_nanos };
+            let position = [0.0, 1.0, 2.0].map(|zero| zero + 0.01 * f64::from(seq)).to_vec();
+            let joints = JointsDatagram { head, position, velocity: vec![0.5; 3], effort: Vec::new() };
+            lines.push(encode_joints(&joints, &names));
+            let head = Head { clock: Clock::Device, ..head };
+            let world_from_base = Transform::translation(0.1 * f64::from(seq), 0.0, 0.5);
+            lines.push(encode_pose(&PoseDatagram { head, world_from_base }));
+            let point = RangePoint { position_m: [1.0, -2.0, 0.5], ring: 3, offset_micros: 7 };
+            let head = Head { seq: u64::from(seq / 2), stamp_nanos: i64::from(seq / 2) * 6_000_000, ..head };
+            let part = ScanPart { head, frame: "lidar".to_owned(), part: seq % 2, n_parts: 2, points: vec![point; 2] };
+            lines.push(encode_scan(&part));
+        }
+        lines
+    }
+
+    #[test]
+    fn datagrams_cut_doubled_or_out_of_order_move_no_joint() {
+        let lines = talk();
+        let told = joint_states(&lines.join(&b'\n'));
+        assert_eq!(told.len(), 10);
+        let read = |lines: &[Vec<u8>]| {
+            let read = joint_states(&lines.join(&b'\n'));
+            assert!(read.iter().all(|positions| told.contains(positions)), "{read:?}");
+            read.len()
+        };
+        let doubled: Vec<_> = lines.iter().flat_map(|line| [line.clone(), line.clone()]).collect();
+        assert_eq!(read(&doubled), 10, "the second is no news");
+        let mut random = Random(2);
+        for _ in 0..50 {
+            let mut shuffled = lines.clone();
+            random.shuffle(&mut shuffled);
+            assert!(read(&shuffled) <= 10);
+        }
+        for n_bytes in 0..lines[0].len() {
+            let cut: Vec<_> = lines.iter().map(|line| line[..line.len().min(n_bytes)].to_vec()).collect();
+            assert_eq!(read(&cut), 0, "{n_bytes} bytes");
+        }
+        let one_in_one: Vec<_> = lines.iter().map(|line| line.repeat(2)).collect();
+        assert_eq!(read(&one_in_one), 0, "two in one datagram are none");
+    }
+}

@@ -1,0 +1,68 @@
+//! Files of models: splats in `.ply` and `.spz`, checkpoints of training. The crate `trainer` is not linked, for the time it takes.
+//!
+//! A byte that says what, then a whole `.ply`, what a `.spz` packs, a `.spz` as it is, or a checkpoint without its checksum.
+#![no_main]
+#![allow(dead_code, reason = "only reading is looked at here")]
+
+#[path = "../../trainer/src/checkpoint.rs"]
+mod checkpoint;
+#[path = "../../trainer/src/ply/mod.rs"]
+mod ply;
+#[path = "../../trainer/src/spz/mod.rs"]
+mod spz;
+mod splat {
+    pub use crate::arrays;
+}
+#[path = "../../trainer/src/splat/arrays.rs"]
+pub mod arrays;
+
+use sha2::Digest;
+use std::io::Write;
+use std::path::PathBuf;
+
+/// The errors of these files; the trainer's own has the GPU's among them.
+#[derive(Debug)]
+pub enum Error {
+    Read { path: PathBuf, source: std::io::Error },
+    Write { path: PathBuf, source: std::io::Error },
+    SplatFile { path: PathBuf, reason: String },
+    Checkpoint { path: PathBuf, reason: String },
+    CheckpointState { reason: String },
+    SplatArrays(String),
+}
+
+/// A file in memory, written anew each time.
+fn file(bytes: &[u8]) -> PathBuf {
+    let path = PathBuf::from(format!("/dev/shm/fieldrig-model-{}", std::process::id()));
+    std::fs::write(&path, bytes).expect("room for small files");
+    path
+}
+
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
+    let Some((kind, bytes)) = bytes.split_first() else { return };
+    let splats = match kind % 4 {
+        0 => ply::read(&file(bytes)),
+        1 => {
+            let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+            gzip.write_all(bytes).expect("memory");
+            spz::read(&file(&gzip.finish().expect("memory")))
+        }
+        2 => spz::read(&file(bytes)),
+        _ => {
+            let sum = sha2::Sha256::digest(bytes);
+            if let Ok(checkpoint) = checkpoint::Checkpoint::read(&file(&[bytes, &sum[..]].concat())) {
+                let _ = checkpoint.array("means", 12);
+            }
+            return;
+        }
+    };
+    let Ok(splats) = splats else { return };
+    let path = file(&[]);
+    // What lies too far out for one format is refused, all else comes back.
+    for (write, read) in [(ply::write as fn(_, _) -> _, ply::read as fn(_) -> _), (spz::write, spz::read)] {
+        if write(&path, &splats).is_ok() {
+            let again = read(&path).unwrap_or_else(|error: Error| panic!("{error:?}"));
+            assert_eq!((again.n_splats(), again.sh_degree), (splats.n_splats(), splats.sh_degree));
+        }
+    }
+});

@@ -1,0 +1,26 @@
+//! A whole rig file, with the description of a robot beside it. What is accepted is accepted again once it is settled.
+#![no_main]
+#![allow(dead_code, unused_imports, reason = "only reading is looked at here")]
+
+#[path = "../../src/config/mod.rs"]
+mod config;
+#[path = "../../src/method/kind.rs"]
+mod kind;
+mod method {
+    pub(crate) use crate::kind::Kind;
+}
+
+const URDF: &str = include_str!("../../kinematics/tests/data/panda.urdf");
+
+libfuzzer_sys::fuzz_target!(|text: &str| {
+    match config::Rig::parse("rig.toml", text, URDF, &[]) {
+        Ok(rig) => {
+            let settled = rig.to_toml();
+            let again = config::Rig::parse("rig.toml", &settled, &rig.arm.urdf_text, &[]);
+            if let Err(error) = again {
+                panic!("{error}\n{settled}");
+            }
+        }
+        Err(error) => drop(error.to_string()),
+    }
+});

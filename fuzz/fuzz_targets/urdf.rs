@@ -1,0 +1,16 @@
+//! A whole robot's description: every chain in it moves as numbers do.
+#![no_main]
+use kinematics::Chain;
+use kinematics::urdf::Robot;
+
+libfuzzer_sys::fuzz_target!(|text: &str| {
+    let Ok(robot) = Robot::parse(text) else { return };
+    let Ok(root) = robot.root() else { return };
+    for tip in robot.links() {
+        let Ok(chain) = Chain::new(&robot, root, tip) else { continue };
+        let q = vec![0.5; chain.n_joints()];
+        let _ = chain.forward(&q);
+        let _ = chain.jacobian(&q);
+        let _ = chain.tip_twist(&q, &q);
+    }
+});

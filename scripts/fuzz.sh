@@ -1,0 +1,30 @@
+#!/usr/bin/env bash
+# Fuzzes the readers of every wire and file format: fuzz.sh SECONDS [TARGET...], all targets where none is named.
+#
+# One after the other, SECONDS each; needs a nightly compiler and cargo-fuzz. What is found lies in fuzz/artifacts: mend it, and put
+# the smallest input that shows it into fuzz/seeds. What was learned stays in fuzz/corpus for the next run.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+seconds=$1
+shift
+cargo +nightly fuzz --version >/dev/null 2>&1 || {
+    echo "cargo-fuzz or a nightly compiler is missing; run these lines, then try again:" >&2
+    echo "    rustup toolchain install nightly && cargo install --locked cargo-fuzz" >&2
+    exit 1
+}
+[ $# -gt 0 ] || mapfile -t all < <(cargo +nightly fuzz list)
+found=()
+for target in "${@:-${all[@]}}"; do
+    seeds=()
+    for folder in "fuzz/seeds/$target" $(case $target in rig) echo rigs ;; urdf) echo rigs/robots kinematics/tests/data ;; esac); do
+        [ ! -d "$folder" ] || seeds+=("$folder")
+    done
+    mkdir -p "fuzz/corpus/$target"
+    echo "== $target"
+    cargo +nightly fuzz run "$target" "fuzz/corpus/$target" "${seeds[@]}" -- \
+        -max_total_time="$seconds" -timeout=5 -rss_limit_mb=2048 -max_len=8192 -print_final_stats=1 || found+=("$target")
+done
+[ ${#found[@]} -eq 0 ] || {
+    echo "found something: ${found[*]}" >&2
+    exit 1
+}
