@@ -4,10 +4,10 @@
 #![cfg(target_os = "linux")]
 
 use drivers::Arm;
-use drivers::franka::played::{Joints, Limits, PlayedRobot, RobotConfig, Wanted};
+use drivers::franka::played::{Joints, Limits, Owner, PlayedRobot, RobotConfig};
 use drivers::franka::{ArmConfig, ContactConfig, FciVersion, FrankaArm, MovableFrankaArm, N_JOINTS};
 use drivers::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
-use kinematics::{Chain, Stamp, Transform};
+use kinematics::{Chain, Transform};
 use std::fs;
 use std::io::Write;
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
@@ -124,12 +124,12 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
     const NEAR_RAD: f64 = 5e-3; // franka-sim's joints have mass.
     for tried in 1..=MAX_TRIED {
         let mut arm = open();
-        let rest = arm.read(PATIENCE).unwrap().position;
+        let rest = arm.read(PATIENCE).expect("it tells its joints").position;
         let mut ways = [-1.0, 0.0, 1.0, 0.0].into_iter().cycle();
         while arm.motion_statistics().n_answered < 10_000 {
-            let by_rad = BY_RAD * ways.next().unwrap();
+            let by_rad = BY_RAD * ways.next().expect("there is always another");
             let target = JointTarget { position: rest.iter().map(|rest| rest + by_rad).collect() };
-            assert_eq!(arm.command(&target).unwrap(), target);
+            assert_eq!(arm.command(&target).expect("a target in its range"), target);
             let until = Instant::now() + PATIENCE;
             while arm.motion() == Motion::Moving {
                 assert!(Instant::now() < until, "it never comes to rest: {}", arm.motion_statistics());
@@ -137,7 +137,7 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
             }
             if let Motion::Stopped { reason } = arm.motion() {
                 assert!(reason.contains("communication_constraints_violation"), "{name}: {reason}");
-                arm.recover().unwrap();
+                arm.recover().expect("it recovers");
                 continue;
             }
             let position = newest(&mut arm);
@@ -146,7 +146,7 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
         }
         let statistics = arm.motion_statistics();
         report(&format!("our driver moves {name}: {statistics}\n"));
-        let [told, _] = statistics.robots_success_frac().unwrap();
+        let [told, _] = statistics.robots_success_frac().expect("it has moved");
         if statistics.success_frac() > 0.99 && told > 0.99 && statistics.n_motions > 0 {
             return;
         }
@@ -157,7 +157,7 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
 /// Where the joints are after they came to rest: states from before may wait.
 fn newest(arm: &mut MovableFrankaArm) -> Vec<f64> {
     std::thread::sleep(Duration::from_millis(100));
-    let mut position = arm.read(PATIENCE).unwrap().position;
+    let mut position = arm.read(PATIENCE).expect("it tells its joints").position;
     while let Ok(state) = arm.read(Duration::ZERO) {
         position = state.position;
     }
@@ -172,15 +172,16 @@ struct SomebodyElses {
 
 impl SomebodyElses {
     fn start(python: &Path) -> Self {
-        let port = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap().local_addr().unwrap().port();
-        let log = fs::File::create(folder().join("franka-sim.log")).unwrap();
+        let port =
+            TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port").local_addr().expect("a free port").port();
+        let log = fs::File::create(folder().join("franka-sim.log")).expect("room on the disk");
         // Its own model has to be fetched; ours is of primitives.
         let (root, model) = (Path::new(env!("CARGO_MANIFEST_DIR")).join(".."), folder().join("panda.xml"));
         let made = Command::new(python)
             .arg(root.join("tests/hil/franka_sim_model.py"))
             .args([&root.join("rigs/robots/panda.urdf"), &model])
             .output()
-            .unwrap();
+            .expect("Python starts");
         assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
         let child = Command::new(python)
             .args(["-m", "franka_sim.run_server", "--no-gripper"])
@@ -190,7 +191,7 @@ impl SomebodyElses {
             .stdout(Stdio::null())
             .stderr(log)
             .spawn()
-            .unwrap();
+            .expect("Python starts");
         Self { address: SocketAddr::from((Ipv4Addr::LOCALHOST, port)).to_string(), _process: Killed(child) }
     }
 
@@ -214,7 +215,7 @@ impl SomebodyElses {
 }
 
 /// Joints that rest there, and then are where they are wanted.
-fn obedient(rest_rad: [f64; N_JOINTS]) -> Box<dyn FnMut(Stamp, &Wanted) -> Joints + Send> {
+fn obedient(rest_rad: [f64; N_JOINTS]) -> Owner {
     let mut is_first = true;
     Box::new(move |_, wanted| {
         let position_rad = if std::mem::take(&mut is_first) { rest_rad } else { wanted.position_rad };

@@ -152,7 +152,8 @@ mod tests {
         }
         assert_eq!(Record::decode(0x0B, &[]), Ok(Record::Other));
         assert_eq!(Record::decode(ATTACHMENT, &attachment(|_| 0)), Record::decode(ATTACHMENT, &whole), "none is told");
-        let wrong = Record::decode(ATTACHMENT, &attachment(|_| 1));
+        let damaged = attachment(|_| 1);
+        let wrong = Record::decode(ATTACHMENT, &damaged);
         assert_eq!(wrong, Err(Wrong::Checksum { name: "rig.toml".to_owned() }));
     }
 

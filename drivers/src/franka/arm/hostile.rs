@@ -23,7 +23,7 @@ pub fn states(bytes: &[u8]) {
 
 /// Angles of all joints that an arm would tell of the datagrams, see [`states`].
 pub(crate) fn told(version: FciVersion, mut bytes: &[u8]) -> Vec<Vec<f64>> {
-    let mut line = Line::new("it".to_owned(), version);
+    let mut line = Line::new("it".to_owned(), version, None);
     let mut waiting = Waiting::default();
     let mut at = BEGAN;
     while !bytes.is_empty() {
