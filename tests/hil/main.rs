@@ -14,6 +14,8 @@ mod kvaser;
 #[cfg(feature = "nokhwa")]
 mod nokhwa;
 mod qemu;
+#[cfg(all(feature = "realsense", feature = "sim"))]
+mod wire;
 mod wire_errors;
 
 use std::collections::BTreeSet;
@@ -61,6 +63,8 @@ fn cameras_and_buses_in_a_kernel_of_their_own() {
         let kernel = build_kernel("um", &folder);
         let root = folder.join("root");
         lay_out(&root, INIT, &[]);
+        #[cfg(all(feature = "realsense", feature = "sim"))]
+        wire::lay_out(&root);
         boot(&kernel, &root, &folder)
     });
 }

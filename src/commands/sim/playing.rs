@@ -275,3 +275,36 @@ fn wait(stop: &Stop, begins: Stamp, args: &Args) -> anyhow::Result<()> {
     bar.finish_and_clear();
     Ok(())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn scenes_on_the_wire_are_those_that_are_simulated() {
+        let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
+        for (name, ..) in SCENES {
+            let (_, wire) = load(name).expect("it comes along");
+            let mut plain = Rig::load(&rigs.join(format!("{name}.toml")), &[]).expect("it comes along");
+            plain.arm = wire.arm.clone();
+            plain.base.driver = wire.base.driver;
+            for (camera, on_wire) in plain.cameras.iter_mut().zip(&wire.cameras) {
+                camera.driver = on_wire.driver;
+                camera.stamp_to_mid_exposure = on_wire.stamp_to_mid_exposure.clone();
+            }
+            assert_eq!(plain, wire, "{name}");
+            assert_eq!(Rig::load(&rigs.join(format!("wire/{name}.toml")), &[]).expect("the same file"), wire);
+        }
+    }
+
+    #[test]
+    fn rigs_that_cannot_be_played_are_refused_before_anything_is_simulated() {
+        let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
+        let plain = Rig::load(&rigs.join("static-arm.toml"), &[]).expect("it comes along");
+        assert!(check(&plain).is_err_and(|error| error.to_string().contains("arm.driver is sim")));
+        assert!(load("no-such-rig").is_err_and(|error| error.to_string().contains("scenes: static-arm, mobile-arm")));
+        assert_eq!(fci_address("127.0.0.1").expect("an address").port(), FCI_PORT);
+        assert_eq!(fci_address("127.0.0.1:5").expect("an address").port(), 5);
+        assert!(fci_address("").is_err());
+    }
+}

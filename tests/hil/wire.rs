@@ -1,0 +1,62 @@
+//! Inside the virtual kernel: the simulated mobile arm on the wire, motors of four families on one bus, its base by datagrams, its
+//! camera as a file; read, and then moved, by the production binary.
+
+#[path = "../wire/compare.rs"]
+mod compare;
+
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+/// What was simulated on the host.
+pub const SCRIPT: &str = "rigs/mobile-arm.mcap";
+pub const SECONDS: &str = "6";
+
+/// Simulates the rig of the scene into a root folder.
+pub fn lay_out(root: &Path) {
+    let rig = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/wire/mobile-arm.toml");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
+    command.arg("record").arg(rig).args(["--sim", "--lockstep", "--seconds", SECONDS, "--out"]).arg(root.join(SCRIPT));
+    let output = command.output().expect("it is built");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+#[test]
+#[ignore = "needs the virtual kernel"]
+fn the_mobile_arm_comes_through_its_drivers_and_is_moved() {
+    let script = Path::new("/").join(SCRIPT);
+    let mut playing = Command::new("/bin/fieldrig")
+        .args(["sim", "mobile-arm", "--from"])
+        .arg(&script)
+        .args(["--seconds", SECONDS, "--start-in", "10", "--out", "/tmp/mobile", "--json"])
+        .stdout(Stdio::piped())
+        .spawn()
+        .expect("it is laid out");
+    let mut line = String::new();
+    BufReader::new(playing.stdout.take().expect("piped")).read_line(&mut line).expect("it prints a line");
+    assert!(line.contains("\"event\":\"ready\"") && line.contains("7 motors on vcan0"), "{line}");
+    let fieldrig = |words: &[&str]| {
+        let output = Command::new("/bin/fieldrig").args(words).output().expect("it is laid out");
+        let told = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
+        println!("fieldrig {}: {told}", words.join(" "));
+        (output.status.code(), told)
+    };
+    let (code, told) = fieldrig(&["record", "/tmp/mobile/rig.toml", "--out", "/tmp/mobile.mcap", "--json"]);
+    // A busy machine loses images, which are counted.
+    assert!(matches!(code, Some(0 | 3)), "{told}");
+    let difference = compare::difference(&script, Path::new("/tmp/mobile.mcap"));
+    println!("wire: {difference:?}");
+    assert!(difference.n_images >= 20, "{difference:?}");
+    // Motors that report by themselves do so every 10 ms, and a joint turns by less than half a radian in a second.
+    assert!(difference.joints_rad[0] < 2e-3, "{difference:?}");
+    assert!(difference.base_m < 1e-6, "{difference:?}");
+
+    let words = ["move", "/tmp/mobile/rig.toml", "--by", "panda_joint1=0.1", "--enable-motion", "--leave", "--json"];
+    let (code, told) = fieldrig(&words);
+    assert_eq!(code, Some(0), "{told}");
+    let done = told.lines().find(|line| line.contains("\"event\":\"done\"")).expect("it arrives");
+    let error = done.split_once("\"error\":").and_then(|(_, rest)| rest.split([',', '}']).next()?.parse::<f64>().ok());
+    assert!(error.is_some_and(|error| error < 0.01), "{done}");
+    let _ = playing.kill(); // It plays until it is stopped.
+    let _ = playing.wait();
+}

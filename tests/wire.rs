@@ -1,0 +1,71 @@
+//! `fieldrig sim` in one process, the production drivers in others: what is played comes through as it was, and the arm can be moved.
+
+#![cfg(target_os = "linux")]
+
+#[path = "wire/compare.rs"]
+mod compare;
+
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+
+/// For a machine that does much else.
+const START_IN: &str = "5";
+
+/// A `fieldrig sim` that is ready; ended when dropped.
+struct Playing(Child);
+
+impl Playing {
+    fn start(folder: &Path) -> Self {
+        let mut child = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
+            .args(["sim", "static-arm", "--seconds", "3", "--start-in", START_IN, "--json", "--out"])
+            .arg(folder)
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("it is built");
+        let mut line = String::new();
+        let stdout = child.stdout.take().expect("piped");
+        BufReader::new(stdout).read_line(&mut line).expect("it prints a line");
+        assert!(line.contains("\"event\":\"ready\"") && line.contains("FCI 10"), "{line}");
+        Self(child)
+    }
+}
+
+impl Drop for Playing {
+    fn drop(&mut self) {
+        let _ = self.0.kill(); // Gone already.
+        let _ = self.0.wait(); // Its exit code is of no interest.
+    }
+}
+
+fn fieldrig(words: &[&str], rig: &Path) -> (Option<i32>, String) {
+    let output = Command::new(env!("CARGO_BIN_EXE_fieldrig")).arg(words[0]).arg(rig).args(&words[1..]).output();
+    let output = output.expect("it is built");
+    let told = [output.stdout, output.stderr].concat();
+    (output.status.code(), String::from_utf8_lossy(&told).into_owned())
+}
+
+#[test]
+fn a_simulated_franka_rig_comes_through_its_drivers_and_is_moved() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let playing = Playing::start(folder.path());
+    let (rig, script, wire) =
+        (folder.path().join("rig.toml"), folder.path().join("script.mcap"), folder.path().join("wire.mcap"));
+    // A file's end ends the recording, and is none of a loss; a busy machine may lose images, which is one.
+    let (code, told) = fieldrig(&["record", "--out", &wire.to_string_lossy(), "--json"], &rig);
+    assert!(matches!(code, Some(0 | 3)), "{told}");
+    let difference = compare::difference(&script, &wire);
+    println!("{difference:?}");
+    assert!(difference.n_images >= 60, "{difference:?}");
+    // A joint turns by half a radian a second at most here: a millisecond is half a milliradian.
+    assert!(difference.joints_rad[0] < 5e-4, "{difference:?}");
+
+    let (code, told) = fieldrig(&["move", "--by", "panda_joint1=0.05", "--enable-motion", "--json"], &rig);
+    assert_eq!(code, Some(0), "{told}");
+    let done = told.lines().find(|line| line.contains("\"event\":\"done\"")).expect("it arrives");
+    let error = done.split_once("\"error\":").and_then(|(_, rest)| rest.split([',', '}']).next()?.parse::<f64>().ok());
+    assert!(error.is_some_and(|error| error < 1e-3), "{done}");
+    let (code, told) = fieldrig(&["move", "--by", "panda_joint1=0.05", "--json"], &rig);
+    assert_eq!(code, Some(2), "without a word that it may move it does not: {told}");
+    drop(playing);
+}

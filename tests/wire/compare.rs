@@ -1,0 +1,80 @@
+//! What was played on the wire beside what came through the drivers.
+
+use drivers::recording::{RIG_FILE, Recording};
+use drivers::{Image, Sample, Source};
+use kinematics::{JointHistory, PoseHistory, Stamp};
+use std::path::Path;
+use std::time::Duration;
+
+/// What a recording holds.
+pub struct Heard {
+    /// Color and depth, in their order.
+    pub images: Vec<Image>,
+    pub joints: JointHistory,
+    pub poses: PoseHistory,
+}
+
+/// How what came through differs from what was played, at the stamps of the images.
+#[derive(Debug)]
+pub struct Difference {
+    pub n_images: usize,
+    /// Of any joint, rad, in the median image and in the worst.
+    pub joints_rad: [f64; 2],
+    /// Of the base, m.
+    pub base_m: f64,
+}
+
+pub fn heard(path: &Path) -> Heard {
+    let mut recording = Recording::open(path).expect("a recording");
+    let gap = Duration::from_millis(100);
+    let (joints, poses) = (JointHistory::new(gap, usize::MAX), PoseHistory::new(gap, usize::MAX));
+    let mut heard = Heard { images: Vec::new(), joints, poses };
+    while let Some(sample) = recording.next_sample().expect("it is whole") {
+        match sample {
+            Sample::Image(image) => heard.images.push(image),
+            Sample::Joints(state) => heard.joints.push(state).expect("in order"),
+            Sample::Base(pose) => heard.poses.push(pose.stamp, pose.world_from_base).expect("in order"),
+            _ => {}
+        }
+    }
+    heard
+}
+
+/// What is added to the stamps of the script when it is played, as the rig file says that was written for it.
+pub fn clock_offset_nanos(recording: &Path) -> i64 {
+    let recording = Recording::open(recording).expect("a recording");
+    let rig = std::str::from_utf8(recording.attachment(RIG_FILE).expect("its rig")).expect("text").to_owned();
+    let line = rig.lines().find_map(|line| line.strip_prefix("clock_offset_nanos = ")).expect("the key");
+    line.trim().parse().expect("a number")
+}
+
+/// Compares at every color image that came through; each must be one of those played, to the pixel.
+pub fn difference(script: &Path, wire: &Path) -> Difference {
+    let offset_nanos = clock_offset_nanos(wire);
+    let (script, wire) = (heard(script), heard(wire));
+    let mut joints_rad = Vec::new();
+    let mut base_m: f64 = 0.0;
+    let n_images = wire.images.len();
+    for image in &wire.images {
+        let scripted = Stamp(image.stamp.0 - offset_nanos);
+        // Cameras count microseconds.
+        let is_it =
+            |played: &&Image| played.is_depth() == image.is_depth() && played.stamp.0.abs_diff(scripted.0) < 1000;
+        let played = script.images.iter().find(is_it).unwrap_or_else(|| panic!("no image was played at {scripted:?}"));
+        if image.is_depth() {
+            assert_eq!(image.data, played.data, "depth at {scripted:?}");
+        } else {
+            assert_eq!(image.decode_rgb().expect("RGB"), played.decode_rgb().expect("RGB"), "image at {scripted:?}");
+        }
+        if let (Ok(told), Ok(played)) = (wire.joints.at(image.stamp), script.joints.at(scripted)) {
+            let offs = told.position.iter().zip(&played.position).map(|(told, played)| (told - played).abs());
+            joints_rad.push(offs.fold(0.0, f64::max));
+        }
+        if let (Ok(told), Ok(played)) = (wire.poses.at(image.stamp), script.poses.at(scripted)) {
+            base_m = base_m.max((told.translation.vector - played.translation.vector).norm());
+        }
+    }
+    assert!(!joints_rad.is_empty(), "no image has joints around it");
+    joints_rad.sort_by(f64::total_cmp);
+    Difference { n_images, joints_rad: [joints_rad[joints_rad.len() / 2], joints_rad[joints_rad.len() - 1]], base_m }
+}
