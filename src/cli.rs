@@ -48,7 +48,7 @@ pub(crate) enum Command {
     Devices(devices::Args),
     /// Check GPU, clocks, memory and permissions, and name the line that mends what is amiss
     Doctor(doctor::Args),
-    /// Play a rig's devices on the wire: a robot's controller, motors on CAN buses, datagrams, recordings of cameras
+    /// Play a rig's devices on the wire: controller, CAN motors, datagrams, camera files
     Sim(sim::Args),
     /// Move an arm to given joint positions, within its limits, while a person watches
     Move(move_arm::Args),

@@ -4,8 +4,9 @@ use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
 /// Commands that `fieldrig --help` must list, each with help of its own.
-const COMMANDS: [&str; 11] =
-    ["run", "record", "train", "render", "eval", "metrics", "bench", "export", "fk", "devices", "doctor"];
+const COMMANDS: [&str; 13] = [
+    "run", "record", "train", "render", "eval", "metrics", "bench", "export", "fk", "devices", "doctor", "sim", "move",
+];
 
 fn fieldrig(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_fieldrig")).args(args).output().expect("fieldrig starts")

@@ -7,6 +7,8 @@ use franka::RobotState;
 
 /// A robot that is wanted further from where we think it is, is wanted elsewhere; below this is what FCI 10 rounds off, up to 8 rad.
 const NEAR_RAD: f64 = 4e-7;
+/// The same of rates, up to 8 rad/s.
+const NEAR_RAD_S: f64 = 1e-6;
 /// A robot may tell where it was wanted so many steps ago: `franka-sim` tells what its joints' own thread has taken.
 const MAX_BEHIND: f64 = 3.0;
 /// After so many commands that do not come in a row the robot stops. Source: FCI documentation, "Real-time control commands".
@@ -62,9 +64,9 @@ impl Reference {
 
     /// So many states later than this one, of which the first was answered with `sent`, and what became of that.
     ///
-    /// Our own numbers are kept where the robot's are the same but for their rounding: differences of rounded ones are rough. A
-    /// single command that did not arrive is within that rounding where the jerk is small, and is then taken as followed: with the
-    /// next one that arrives that is true again.
+    /// Our own numbers are kept where the robot's are the same but for their rounding: differences of rounded ones are rough. Where
+    /// a command that did not arrive is within that rounding, the rates that the robot tells say so: of them it is seen a thousand
+    /// times better.
     pub(super) fn later(&self, sent: Option<[f64; N_JOINTS]>, n_states: u64, state: &RobotState) -> (Self, Fate) {
         let told = Self::told(state);
         if n_states > MAX_MISSED {
@@ -75,19 +77,22 @@ impl Reference {
             let both = reference.position_rad.into_iter().zip(told.position_rad);
             both.into_iter().all(|(ours, theirs)| (ours - theirs).abs() <= NEAR_RAD)
         };
+        let has_rates = |reference: &Self| {
+            let both = reference.velocity_rad_s.into_iter().zip(told.velocity_rad_s);
+            both.into_iter().all(|(ours, theirs)| (ours - theirs).abs() <= NEAR_RAD_S)
+        };
         let n_after = n_states.saturating_sub(1);
         let with = sent.map(|position_rad| go_on(self.sent(position_rad), n_after)).filter(is_near);
+        let without = go_on(*self, n_states);
         match with {
+            Some(with) if !has_rates(&with) && has_rates(&without) => (without, Fate::Missed(n_states)),
             Some(with) if n_after == 0 => (with, Fate::Followed),
             Some(with) => (with, Fate::Missed(n_after)),
-            None => {
-                let without = go_on(*self, n_states);
-                match sent.map(|position_rad| go_on(self.sent(position_rad), n_after)) {
-                    _ if is_near(&without) => (without, Fate::Missed(n_states)),
-                    Some(with) if n_after == 0 && with.is_shortly_after(&told) => (with, Fate::Followed),
-                    _ => (told, Fate::Unknown),
-                }
-            }
+            None => match sent.map(|position_rad| go_on(self.sent(position_rad), n_after)) {
+                _ if is_near(&without) => (without, Fate::Missed(n_states)),
+                Some(with) if n_after == 0 && with.is_shortly_after(&told) => (with, Fate::Followed),
+                _ => (told, Fate::Unknown),
+            },
         }
     }
 
@@ -154,14 +159,16 @@ mod tests {
     }
 
     #[test]
-    fn what_is_lost_in_the_rounding_is_taken_as_followed_and_comes_right_with_the_next() {
+    fn what_is_lost_in_the_rounding_of_positions_is_seen_in_the_rates() {
         let (reference, next) = moving(20.0);
-        let missed = reference.missed();
-        let (taken, fate) = reference.later(Some(next), 1, &state(&missed));
-        assert_eq!((taken, fate), (reference.sent(next), Fate::Followed));
-        let after = taken.position_rad.map(|position| position + 3e-4);
-        let (taken, fate) = taken.later(Some(after), 1, &state(&missed.sent(after)));
-        assert_eq!((taken.position_rad, fate), (missed.sent(after).position_rad, Fate::Followed));
+        let (missed, followed) = (reference.missed(), reference.sent(next));
+        assert!((followed.position_rad[0] - missed.position_rad[0]).abs() < NEAR_RAD);
+        assert_eq!(reference.later(Some(next), 1, &state(&missed)), (missed, Fate::Missed(1)));
+        assert_eq!(reference.later(Some(next), 1, &state(&followed)), (followed, Fate::Followed));
+        // A robot whose rates are none of ours is taken to follow, as its position says.
+        let mut smoothed = followed;
+        smoothed.velocity_rad_s = [0.29; N_JOINTS];
+        assert_eq!(reference.later(Some(next), 1, &state(&smoothed)), (followed, Fate::Followed));
     }
 
     #[test]
