@@ -236,8 +236,17 @@ fn motors_of_all_families_go_where_they_are_sent_and_back() {
     assert_eq!(arm.motion(), Motion::Held);
     // The motors were found at 0, and those joints are elsewhere: nothing has moved by being switched on.
     let found: Vec<f64> = configs.iter().map(|config| config.offset_rad).collect();
-    // Half a count in the command and half in the answer; drives and ODrives resolve finer.
-    let counts = [25.0 / 65_535.0, 25.0 / 65_535.0, 25.2 / 65_535.0, 1e-5, 1e-4, 25.0 / 65_535.0];
+    // Half a count in the command and half in the answer; drives and ODrives resolve finer. In MIT mode no count of velocity is 0: half
+    // a one pushes a motor as far aside as damping is to stiffness.
+    let pushed = |limit_rad_s: f64, counts: f64| limit_rad_s / counts * GAINS.damping_nm_s_rad / GAINS.stiffness_nm_rad;
+    let counts = [
+        25.0 / 65_535.0 + pushed(30.0, 4095.0),
+        25.0 / 65_535.0 + pushed(30.0, 4095.0),
+        25.2 / 65_535.0 + pushed(44.0, 65_535.0),
+        1e-5,
+        1e-4,
+        25.0 / 65_535.0 + pushed(50.0, 4095.0),
+    ];
     let off = |got: &[f64], wanted: &[f64]| -> Vec<f64> {
         got.iter().zip(wanted).map(|(got, wanted)| (got - wanted).abs()).collect()
     };
