@@ -7,13 +7,17 @@ mod compare;
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, ChildStdout, Command, Stdio};
 
 /// For a machine that does much else.
 const START_IN: &str = "5";
 
 /// A `fieldrig sim` that is ready; ended when dropped.
-struct Playing(Child);
+struct Playing {
+    child: Child,
+    /// It ends where nobody reads what it prints.
+    _stdout: BufReader<ChildStdout>,
+}
 
 impl Playing {
     fn start(folder: &Path) -> Self {
@@ -24,17 +28,17 @@ impl Playing {
             .spawn()
             .expect("it is built");
         let mut line = String::new();
-        let stdout = child.stdout.take().expect("piped");
-        BufReader::new(stdout).read_line(&mut line).expect("it prints a line");
+        let mut stdout = BufReader::new(child.stdout.take().expect("piped"));
+        stdout.read_line(&mut line).expect("it prints a line");
         assert!(line.contains("\"event\":\"ready\"") && line.contains("FCI 10"), "{line}");
-        Self(child)
+        Self { child, _stdout: stdout }
     }
 }
 
 impl Drop for Playing {
     fn drop(&mut self) {
-        let _ = self.0.kill(); // Gone already.
-        let _ = self.0.wait(); // Its exit code is of no interest.
+        let _ = self.child.kill(); // Gone already.
+        let _ = self.child.wait(); // Its exit code is of no interest.
     }
 }
 
@@ -59,6 +63,7 @@ fn a_simulated_franka_rig_comes_through_its_drivers_and_is_moved() {
     assert!(difference.n_images >= 60, "{difference:?}");
     // A joint turns by half a radian a second at most here: a millisecond is half a milliradian.
     assert!(difference.joints_rad[0] < 5e-4, "{difference:?}");
+    assert_eq!(difference.base_m, 0.0, "it stands still");
 
     let (code, told) = fieldrig(&["move", "--by", "panda_joint1=0.05", "--enable-motion", "--json"], &rig);
     assert_eq!(code, Some(0), "{told}");

@@ -9,11 +9,11 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 /// What was simulated on the host.
-pub const SCRIPT: &str = "rigs/mobile-arm.mcap";
-pub const SECONDS: &str = "6";
+pub(crate) const SCRIPT: &str = "rigs/mobile-arm.mcap";
+pub(crate) const SECONDS: &str = "6";
 
 /// Simulates the rig of the scene into a root folder.
-pub fn lay_out(root: &Path) {
+pub(crate) fn lay_out(root: &Path) {
     let rig = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/wire/mobile-arm.toml");
     let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
     command.arg("record").arg(rig).args(["--sim", "--lockstep", "--seconds", SECONDS, "--out"]).arg(root.join(SCRIPT));
@@ -33,7 +33,9 @@ fn the_mobile_arm_comes_through_its_drivers_and_is_moved() {
         .spawn()
         .expect("it is laid out");
     let mut line = String::new();
-    BufReader::new(playing.stdout.take().expect("piped")).read_line(&mut line).expect("it prints a line");
+    // It ends where nobody reads what it prints.
+    let mut stdout = BufReader::new(playing.stdout.take().expect("piped"));
+    stdout.read_line(&mut line).expect("it prints a line");
     assert!(line.contains("\"event\":\"ready\"") && line.contains("7 motors on vcan0"), "{line}");
     let fieldrig = |words: &[&str]| {
         let output = Command::new("/bin/fieldrig").args(words).output().expect("it is laid out");

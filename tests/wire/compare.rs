@@ -7,24 +7,24 @@ use std::path::Path;
 use std::time::Duration;
 
 /// What a recording holds.
-pub struct Heard {
+pub(super) struct Heard {
     /// Color and depth, in their order.
-    pub images: Vec<Image>,
-    pub joints: JointHistory,
-    pub poses: PoseHistory,
+    pub(super) images: Vec<Image>,
+    pub(super) joints: JointHistory,
+    pub(super) poses: PoseHistory,
 }
 
 /// How what came through differs from what was played, at the stamps of the images.
 #[derive(Debug)]
-pub struct Difference {
-    pub n_images: usize,
+pub(super) struct Difference {
+    pub(super) n_images: usize,
     /// Of any joint, rad, in the median image and in the worst.
-    pub joints_rad: [f64; 2],
+    pub(super) joints_rad: [f64; 2],
     /// Of the base, m.
-    pub base_m: f64,
+    pub(super) base_m: f64,
 }
 
-pub fn heard(path: &Path) -> Heard {
+pub(super) fn heard(path: &Path) -> Heard {
     let mut recording = Recording::open(path).expect("a recording");
     let gap = Duration::from_millis(100);
     let (joints, poses) = (JointHistory::new(gap, usize::MAX), PoseHistory::new(gap, usize::MAX));
@@ -41,7 +41,7 @@ pub fn heard(path: &Path) -> Heard {
 }
 
 /// What is added to the stamps of the script when it is played, as the rig file says that was written for it.
-pub fn clock_offset_nanos(recording: &Path) -> i64 {
+pub(super) fn clock_offset_nanos(recording: &Path) -> i64 {
     let recording = Recording::open(recording).expect("a recording");
     let rig = std::str::from_utf8(recording.attachment(RIG_FILE).expect("its rig")).expect("text").to_owned();
     let line = rig.lines().find_map(|line| line.strip_prefix("clock_offset_nanos = ")).expect("the key");
@@ -49,7 +49,7 @@ pub fn clock_offset_nanos(recording: &Path) -> i64 {
 }
 
 /// Compares at every color image that came through; each must be one of those played, to the pixel.
-pub fn difference(script: &Path, wire: &Path) -> Difference {
+pub(super) fn difference(script: &Path, wire: &Path) -> Difference {
     let offset_nanos = clock_offset_nanos(wire);
     let (script, wire) = (heard(script), heard(wire));
     let mut joints_rad = Vec::new();
