@@ -261,7 +261,7 @@ fn motors_of_all_families_go_where_they_are_sent_and_back() {
         const CARRIED_RAD: f64 = 1e-4;
         let mut told = [f64::INFINITY; 6];
         for _ in 0..50 {
-            let state = arm.read(Duration::from_secs(1)).expect("they report");
+            let state = arm.read(Duration::from_secs(1)).unwrap_or_else(|e| panic!("{e}; {:?}", arm.motion()));
             for (least, off) in told.iter_mut().zip(off(&state.position, &target.position)) {
                 *least = least.min(off - CARRIED_RAD);
             }

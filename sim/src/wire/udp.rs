@@ -5,7 +5,7 @@ use drivers::clock;
 use drivers::wire::datagram::{
     Clock, Head, JointsDatagram, PoseDatagram, ScanPart, encode_joints, encode_pose, encode_scan,
 };
-use drivers::{BasePose, Error, RangeScan};
+use drivers::{Error, RangeScan};
 use kinematics::{JointState, Stamp};
 use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
 use std::sync::Arc;
@@ -15,6 +15,8 @@ use std::time::Duration;
 
 /// Echoes in one datagram: as JSON they take about 60 bytes each, and 65 507 fit.
 const MAX_POINTS: usize = 1000;
+/// How often it is told that nothing moves.
+const STILL: Duration = Duration::from_millis(20);
 /// How soon the thread notices that it is to stop.
 const POLL: Duration = Duration::from_millis(50);
 
@@ -29,7 +31,7 @@ pub struct Listeners {
     pub scanners: Vec<(String, SocketAddr)>,
 }
 
-/// A thread that sends until the script is over or it is dropped.
+/// A thread that sends until it is dropped.
 #[derive(Debug)]
 pub struct PlayedSenders {
     stop: Arc<AtomicBool>,
@@ -37,33 +39,24 @@ pub struct PlayedSenders {
 }
 
 impl PlayedSenders {
-    /// Begins to wait for the first datagram's time.
+    /// Begins to send: the script when it is played, and before and after it that joints and base stand still at its ends.
     pub fn start(script: &Script, clockwork: Clockwork, listeners: Listeners) -> Result<Self, Error> {
         let device = "played datagrams".to_owned();
         let any = SocketAddr::from((Ipv4Addr::UNSPECIFIED, 0));
         let socket = UdpSocket::bind(any);
         let socket = socket.map_err(|source| Error::Listen { device: device.clone(), address: any, source })?;
-        let mut datagrams = datagrams(script, clockwork, &listeners);
-        datagrams.sort_by_key(|datagram| datagram.due);
         let stop = Arc::new(AtomicBool::new(false));
-        let stopping = Arc::clone(&stop);
-        let send = move || {
-            for Datagram { due, to, bytes } in datagrams {
-                loop {
-                    if stopping.load(Ordering::Relaxed) {
-                        return;
-                    }
-                    let left = due.duration_since(clock::now());
-                    if left.is_zero() {
-                        break;
-                    }
-                    std::thread::sleep(left.min(POLL));
-                }
-                // Nobody may listen yet, or any more.
-                let _ = socket.send_to(&bytes, to);
-            }
+        let sender = Sender {
+            script: script.clone(),
+            clockwork,
+            n_sent: vec![0; listeners.scanners.len()],
+            listeners,
+            socket,
+            n_joints_sent: 0,
+            n_poses_sent: 0,
+            stop: Arc::clone(&stop),
         };
-        let thread = std::thread::Builder::new().name(device.clone()).spawn(send);
+        let thread = std::thread::Builder::new().name(device.clone()).spawn(move || sender.run());
         let thread = thread.map_err(|source| Error::Thread { device, source })?;
         Ok(Self { stop, thread: Some(thread) })
     }
@@ -79,56 +72,144 @@ impl Drop for PlayedSenders {
     }
 }
 
-struct Datagram {
-    due: Stamp,
-    to: SocketAddr,
-    bytes: Vec<u8>,
+/// One sample of the script, by its place.
+#[derive(Clone, Copy)]
+enum Line {
+    Joints(usize),
+    Pose(usize),
+    /// And which scanner's it is.
+    Scan(usize, usize),
 }
 
-/// Everything that is sent, and when.
-fn datagrams(script: &Script, clockwork: Clockwork, listeners: &Listeners) -> Vec<Datagram> {
-    let head = |seq: usize, stamp: Stamp| Head {
-        seq: seq as u64,
-        clock: Clock::Monotonic,
-        stamp_nanos: clockwork.played_at(stamp).0,
-    };
-    let mut all = Vec::new();
-    if let Some((to, names)) = &listeners.joints {
-        all.extend(script.joints.iter().enumerate().map(|(seq, state)| {
-            let JointState { stamp, position, velocity, effort } = state.clone();
-            let joints = JointsDatagram { head: head(seq, stamp), position, velocity, effort };
-            Datagram { due: clockwork.played_at(stamp), to: *to, bytes: encode_joints(&joints, names) }
-        }));
-    }
-    if let Some(to) = listeners.base {
-        all.extend(script.poses.iter().enumerate().map(|(seq, BasePose { stamp, world_from_base })| {
-            let pose = PoseDatagram { head: head(seq, *stamp), world_from_base: *world_from_base };
-            Datagram { due: clockwork.played_at(*stamp), to, bytes: encode_pose(&pose) }
-        }));
-    }
-    for (name, to) in &listeners.scanners {
-        let turns = script.scans.iter().filter(|scan| *scan.scanner == **name);
-        for (seq, RangeScan { stamp, points, .. }) in turns.enumerate() {
-            let last_micros = points.iter().map(|point| point.offset_micros).max().unwrap_or(0);
-            let due = clockwork.played_at(stamp.plus_secs(f64::from(last_micros) * 1e-6));
-            let chunks: Vec<_> =
-                if points.is_empty() { vec![&points[..]] } else { points.chunks(MAX_POINTS).collect() };
-            let n_parts = u32::try_from(chunks.len()).unwrap_or(u32::MAX);
-            for (part, points) in (0..).zip(chunks) {
-                let points = points.to_vec();
-                let scan = ScanPart { head: head(seq, *stamp), frame: name.clone(), part, n_parts, points };
-                all.push(Datagram { due, to: *to, bytes: encode_scan(&scan) });
+struct Sender {
+    script: Script,
+    clockwork: Clockwork,
+    listeners: Listeners,
+    socket: UdpSocket,
+    n_joints_sent: u64,
+    n_poses_sent: u64,
+    /// Of each scanner.
+    n_sent: Vec<u64>,
+    stop: Arc<AtomicBool>,
+}
+
+impl Sender {
+    fn run(mut self) {
+        let lines = self.lines();
+        if let Some((first, _)) = lines.first() {
+            self.stand_still(0, *first);
+        }
+        for (due, line) in lines {
+            if !self.wait(due) {
+                return;
+            }
+            match line {
+                Line::Joints(ix) => self.send_joints(ix, self.clockwork.played_at(self.script.joints[ix].stamp)),
+                Line::Pose(ix) => self.send_pose(ix, self.clockwork.played_at(self.script.poses[ix].stamp)),
+                Line::Scan(scanner_ix, ix) => self.send_scan(scanner_ix, ix),
             }
         }
+        self.stand_still(usize::MAX, Stamp(i64::MAX));
     }
-    all
+
+    /// The script in the order in which it is sent: scans once they are whole.
+    fn lines(&self) -> Vec<(Stamp, Line)> {
+        let Script { joints, poses, scans } = &self.script;
+        let at = |stamp: Stamp| self.clockwork.played_at(stamp);
+        let mut lines = Vec::new();
+        if self.listeners.joints.is_some() {
+            lines.extend(joints.iter().enumerate().map(|(ix, state)| (at(state.stamp), Line::Joints(ix))));
+        }
+        if self.listeners.base.is_some() {
+            lines.extend(poses.iter().enumerate().map(|(ix, pose)| (at(pose.stamp), Line::Pose(ix))));
+        }
+        for (scanner_ix, (name, _)) in self.listeners.scanners.iter().enumerate() {
+            let turns = scans.iter().enumerate().filter(|(_, scan)| *scan.scanner == **name);
+            lines.extend(turns.map(|(ix, RangeScan { stamp, points, .. })| {
+                let last_micros = points.iter().map(|point| point.offset_micros).max().unwrap_or(0);
+                (at(stamp.plus_secs(f64::from(last_micros) * 1e-6)), Line::Scan(scanner_ix, ix))
+            }));
+        }
+        lines.sort_by_key(|(due, _)| *due);
+        lines
+    }
+
+    /// Tells again and again, until shortly before a time, that joints and base are where one end of the script has them.
+    fn stand_still(&mut self, end: usize, until: Stamp) {
+        let last = |n: usize| n.checked_sub(1).map(|last| last.min(end));
+        let (joints_ix, pose_ix) = (last(self.script.joints.len()), last(self.script.poses.len()));
+        let mut now = clock::now();
+        while now.plus_secs(STILL.as_secs_f64()) < until {
+            if let Some(ix) = joints_ix {
+                self.send_joints(ix, now);
+            }
+            if let Some(ix) = pose_ix {
+                self.send_pose(ix, now);
+            }
+            if !self.wait(now.plus_secs(STILL.as_secs_f64())) {
+                return;
+            }
+            now = clock::now();
+        }
+    }
+
+    /// Waits for a time; false where it is to stop.
+    fn wait(&self, due: Stamp) -> bool {
+        loop {
+            if self.stop.load(Ordering::Relaxed) {
+                return false;
+            }
+            let left = due.duration_since(clock::now());
+            if left.is_zero() {
+                return true;
+            }
+            std::thread::sleep(left.min(POLL));
+        }
+    }
+
+    fn send_joints(&mut self, ix: usize, stamp: Stamp) {
+        let Some((to, names)) = &self.listeners.joints else { return };
+        let JointState { position, velocity, effort, .. } = self.script.joints[ix].clone();
+        let joints = JointsDatagram { head: head(self.n_joints_sent, stamp), position, velocity, effort };
+        self.send(&encode_joints(&joints, names), *to);
+        self.n_joints_sent += 1;
+    }
+
+    fn send_pose(&mut self, ix: usize, stamp: Stamp) {
+        let Some(to) = self.listeners.base else { return };
+        let world_from_base = self.script.poses[ix].world_from_base;
+        self.send(&encode_pose(&PoseDatagram { head: head(self.n_poses_sent, stamp), world_from_base }), to);
+        self.n_poses_sent += 1;
+    }
+
+    fn send_scan(&mut self, scanner_ix: usize, ix: usize) {
+        let (name, to) = self.listeners.scanners[scanner_ix].clone();
+        let RangeScan { stamp, points, .. } = &self.script.scans[ix];
+        let head = head(self.n_sent[scanner_ix], self.clockwork.played_at(*stamp));
+        let chunks: Vec<_> = if points.is_empty() { vec![&points[..]] } else { points.chunks(MAX_POINTS).collect() };
+        let n_parts = u32::try_from(chunks.len()).unwrap_or(u32::MAX);
+        for (part, points) in (0..).zip(chunks) {
+            let scan = ScanPart { head, frame: name.clone(), part, n_parts, points: points.to_vec() };
+            self.send(&encode_scan(&scan), to);
+        }
+        self.n_sent[scanner_ix] += 1;
+    }
+
+    fn send(&self, bytes: &[u8], to: SocketAddr) {
+        // Nobody may listen yet, or any more.
+        let _ = self.socket.send_to(bytes, to);
+    }
+}
+
+fn head(seq: u64, stamp: Stamp) -> Head {
+    Head { seq, clock: Clock::Monotonic, stamp_nanos: stamp.0 }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use drivers::udp::{UdpArm, UdpBase, UdpScanner};
-    use drivers::{Arm, Base, RangePoint, RangeScanner};
+    use drivers::{Arm, Base, BasePose, RangePoint, RangeScanner};
     use kinematics::Transform;
 
     #[test]
@@ -154,7 +235,7 @@ mod tests {
         let mut arm = UdpArm::open(&names, free).expect("a free port");
         let mut base = UdpBase::open(free).expect("a free port");
         let mut scanner = UdpScanner::open("lidar", free).expect("a free port");
-        let played = clock::now().plus_secs(0.05);
+        let played = clock::now().plus_secs(0.2);
         let listeners = Listeners {
             joints: Some((arm.address(), names)),
             base: Some(base.address()),
@@ -163,9 +244,18 @@ mod tests {
         let clockwork = Clockwork { scripted: Stamp(0), played };
         let _senders = PlayedSenders::start(&script, clockwork, listeners).expect("a socket");
         let wait = Duration::from_secs(5);
-        let joints = arm.read(wait).expect("joints");
+        let still = arm.read(wait).expect("joints");
+        assert_eq!(still.position, script.joints[0].position);
+        assert!(still.stamp < clockwork.played_at(Stamp(0)), "told before it is played");
+        let mut joints = still;
+        while joints.stamp < clockwork.played_at(Stamp(0)) {
+            joints = arm.read(wait).expect("joints");
+        }
         assert_eq!(joints, JointState { stamp: clockwork.played_at(Stamp(5 * MILLI)), ..script.joints[0].clone() });
-        let pose = base.next_pose(wait).expect("a pose");
+        let mut pose = base.next_pose(wait).expect("a pose");
+        while pose.stamp < clockwork.played_at(Stamp(0)) {
+            pose = base.next_pose(wait).expect("a pose");
+        }
         assert_eq!((pose.stamp, pose.world_from_base.translation.z), (clockwork.played_at(Stamp(6 * MILLI)), 3.0));
         let scan = scanner.next_scan(wait).expect("a scan");
         assert_eq!((scan.stamp, &scan.points), (clockwork.played_at(Stamp(7 * MILLI)), &script.scans[0].points));
