@@ -184,6 +184,10 @@ impl Moving {
         match (request, &mut self.phase) {
             (Request::HeadFor(target, answer), Phase::Moving { generator }) => {
                 let taken = generator.head_for(&target).map_err(|reason| Error::Motion { reason });
+                if taken.is_ok() {
+                    // Whoever hears that a target is taken may wait for its end at once.
+                    *self.motion.lock().unwrap_or_else(PoisonError::into_inner) = Motion::Moving;
+                }
                 let _ = answer.try_send(taken);
             }
             (Request::Stop(answer), Phase::Moving { generator }) => {

@@ -104,8 +104,8 @@ impl Sender {
                 return;
             }
             match line {
-                Line::Joints(ix) => self.send_joints(ix, self.clockwork.played_at(self.script.joints[ix].stamp)),
-                Line::Pose(ix) => self.send_pose(ix, self.clockwork.played_at(self.script.poses[ix].stamp)),
+                Line::Joints(ix) => self.send_joints(ix, due, false),
+                Line::Pose(ix) => self.send_pose(ix, due),
                 Line::Scan(scanner_ix, ix) => self.send_scan(scanner_ix, ix),
             }
         }
@@ -141,7 +141,7 @@ impl Sender {
         let mut now = clock::now();
         while now.plus_secs(STILL.as_secs_f64()) < until {
             if let Some(ix) = joints_ix {
-                self.send_joints(ix, now);
+                self.send_joints(ix, now, true);
             }
             if let Some(ix) = pose_ix {
                 self.send_pose(ix, now);
@@ -167,9 +167,12 @@ impl Sender {
         }
     }
 
-    fn send_joints(&mut self, ix: usize, stamp: Stamp) {
+    fn send_joints(&mut self, ix: usize, stamp: Stamp, is_still: bool) {
         let Some((to, names)) = &self.listeners.joints else { return };
-        let JointState { position, velocity, effort, .. } = self.script.joints[ix].clone();
+        let JointState { position, mut velocity, effort, .. } = self.script.joints[ix].clone();
+        if is_still {
+            velocity.fill(0.0);
+        }
         let joints = JointsDatagram { head: head(self.n_joints_sent, stamp), position, velocity, effort };
         self.send(&encode_joints(&joints, names), *to);
         self.n_joints_sent += 1;
