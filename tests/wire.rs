@@ -59,7 +59,6 @@ fn a_simulated_franka_rig_comes_through_its_drivers_and_is_moved() {
     let (code, told) = fieldrig(&["record", "--out", &wire.to_string_lossy(), "--json"], &rig);
     assert!(matches!(code, Some(0 | 3)), "{told}");
     let difference = compare::difference(&script, &wire);
-    println!("{difference:?}");
     assert!(difference.n_images >= 60, "{difference:?}");
     // A joint turns by half a radian a second at most here: a millisecond is half a milliradian.
     assert!(difference.joints_rad[0] < 5e-4, "{difference:?}");
