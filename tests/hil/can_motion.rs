@@ -385,12 +385,14 @@ fn a_cut_cable_a_link_that_is_down_and_a_lost_bus_stop_the_arm_for_good() {
                 "the bus is lost" => lose_the_bus("vcan10"),
                 _ => motors.fails.store(true, Ordering::Relaxed),
             }
+            // The program that takes a link down takes its time: now it is down.
+            let is_so_from = clock::now();
             let reason = wait_until_stopped(&arm);
             let told_after = clock::now().duration_since(began);
             assert!(told_after < TIMEOUT + TOLD_SLACK, "{how}: {told_after:?}");
             // Where nothing of us reaches them they stop by themselves; else they were told to.
             let is_mute = ["the cable is cut", "the link is down"].contains(&how);
-            let after_millis = if is_mute { motors.wait_until_lost(began, state) } else { Vec::new() };
+            let after_millis = if is_mute { motors.wait_until_lost(is_so_from, state) } else { Vec::new() };
             motors.wait_until("none obeys", |seen| seen.iter().all(|seen| seen.state != State::Obeys));
             println!(
                 "can: {how}, on_loss = {:?}: told after {:.0} ms ({reason}); motors stopped by themselves after {after_millis:.0?} ms",

@@ -18,6 +18,8 @@ use std::time::{Duration, Instant};
 const POLL: Duration = Duration::from_millis(50);
 /// Readings that may wait for a slow caller: a second of seven motors at 1 kHz.
 pub(super) const MAX_WAITING: usize = 7000;
+/// A turn of a bus's thread that took longer was held up from outside.
+const MAX_TURN: Duration = Duration::from_millis(200);
 /// A motor that says nothing for so long while the others do is told.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
 
@@ -147,8 +149,14 @@ impl Line {
         let mut errors = WireErrors::default();
         let mut heard: Vec<Stamp> = vec![began; self.motors.len()];
         let (mut n_dropped, mut n_unsent) = (0_u64, 0_u64);
+        let mut before = began;
         while !self.stop.load(Ordering::Relaxed) {
             let now = clock::now();
+            let stood_still = now.duration_since(std::mem::replace(&mut before, now));
+            if stood_still > MAX_TURN {
+                // While this computer did something else, nobody listened: no motor is silent for that.
+                heard.iter_mut().for_each(|heard| *heard = heard.plus_secs(stood_still.as_secs_f64()));
+            }
             if !self.cycle.questions.is_empty() && now >= next_cycle {
                 for question in &self.cycle.questions {
                     n_unsent += u64::from(!self.bus.send(question)?);
