@@ -170,7 +170,8 @@ impl Line {
                 Some((stamp, Arrived::Frame(frame))) => {
                     for (ix, (joint_ix, motor)) in self.motors.iter().enumerate() {
                         let Some(reading) = motor.read(&frame) else { continue };
-                        heard[ix] = stamp;
+                        // Not its stamp: whoever reads late does not make a motor silent.
+                        heard[ix] = now;
                         let told = Told { joint_ix: *joint_ix, stamp, reading };
                         match self.sender.try_send(Ok(told)) {
                             Ok(()) => {}
