@@ -66,7 +66,8 @@ impl Reference {
     ///
     /// Our own numbers are kept where the robot's are the same but for their rounding: differences of rounded ones are rough. Where
     /// a command that did not arrive is within that rounding, the rates that the robot tells say so: of them it is seen a thousand
-    /// times better.
+    /// times better. Rates that are still those of before prove nothing: `franka-sim` tells those of its joints, which are at rest
+    /// for a while after their target is not.
     pub(super) fn later(&self, sent: Option<[f64; N_JOINTS]>, n_states: u64, state: &RobotState) -> (Self, Fate) {
         let told = Self::told(state);
         if n_states > MAX_MISSED {
@@ -85,7 +86,9 @@ impl Reference {
         let with = sent.map(|position_rad| go_on(self.sent(position_rad), n_after)).filter(is_near);
         let without = go_on(*self, n_states);
         match with {
-            Some(with) if !has_rates(&with) && has_rates(&without) => (without, Fate::Missed(n_states)),
+            Some(with) if !has_rates(&with) && has_rates(&without) && !has_rates(self) => {
+                (without, Fate::Missed(n_states))
+            }
             Some(with) if n_after == 0 => (with, Fate::Followed),
             Some(with) => (with, Fate::Missed(n_after)),
             None => match sent.map(|position_rad| go_on(self.sent(position_rad), n_after)) {
@@ -169,6 +172,18 @@ mod tests {
         let mut smoothed = followed;
         smoothed.velocity_rad_s = [0.29; N_JOINTS];
         assert_eq!(reference.later(Some(next), 1, &state(&smoothed)), (followed, Fate::Followed));
+    }
+
+    #[test]
+    fn joints_still_at_rest_do_not_prove_that_a_command_was_missed() {
+        let rest = Reference {
+            position_rad: [1.9; N_JOINTS],
+            velocity_rad_s: [0.0; N_JOINTS],
+            acceleration_rad_s2: [0.0; N_JOINTS],
+        };
+        let first = rest.sent([1.9 + 20.0 * STEP_SECS.powi(3) / 6.0; N_JOINTS]);
+        let told = state(&Reference { position_rad: first.position_rad, ..rest });
+        assert_eq!(rest.later(Some(first.position_rad), 1, &told), (first, Fate::Followed));
     }
 
     #[test]

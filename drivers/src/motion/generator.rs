@@ -10,7 +10,8 @@ use rsruckig::prelude::{
 };
 use std::time::Duration;
 
-/// How far outside its range a joint may be found, radians or metres: by play, or by an encoder's offset.
+/// How far outside its range a joint may be found, radians or metres: by play, by an encoder's offset, or by a motion that went on
+/// without us and is too fast to stop before the end of the range.
 const MAX_OUTSIDE: f64 = 0.02;
 
 /// Where joints are to be at an instant, in their order; radians or metres, and seconds.
@@ -71,8 +72,6 @@ impl Generator {
         input.max_velocity = each(|joint| joint.velocity);
         input.max_acceleration = each(|joint| joint.acceleration);
         input.max_jerk = each(|joint| joint.jerk);
-        input.min_position = Some(each(|joint| joint.position[0]));
-        input.max_position = Some(each(|joint| joint.position[1]));
         let ruckig = Ruckig::new(Some(n), period.as_secs_f64());
         Ok(Self { ruckig, input, output: OutputParameter::new(Some(n)), limits, is_held: true })
     }
@@ -86,6 +85,7 @@ impl Generator {
         self.input.control_interface = ControlInterface::Position;
         self.input.synchronization = Synchronization::Time;
         self.input.target_position = list(position.iter().copied());
+        self.keep_in_range();
         self.is_held = false;
         Ok(JointTarget { position })
     }
@@ -106,8 +106,15 @@ impl Generator {
         self.input.current_position = list(from.position.iter().copied());
         self.input.current_velocity = list(from.velocity.iter().copied());
         self.input.current_acceleration = list(from.acceleration.iter().copied());
+        self.keep_in_range();
         self.is_held = false;
         Ok(())
+    }
+
+    /// The ways from here on stay in the ranges.
+    fn keep_in_range(&mut self) {
+        self.input.min_position = Some(list(self.limits.iter().map(|joint| joint.position[0])));
+        self.input.max_position = Some(list(self.limits.iter().map(|joint| joint.position[1])));
     }
 
     /// Whether it is at rest where it was headed for.
@@ -115,10 +122,33 @@ impl Generator {
         self.is_held
     }
 
+    /// A step on a way that leaves the ranges a little and comes back, where none stays inside; `None` where that is no help.
+    /// A stop is as short as it can be, wherever it ends.
+    fn overshoot(&mut self) -> Option<RuckigResult> {
+        let ends = (self.input.min_position.take(), self.input.max_position.take());
+        let result = self.ruckig.update(&self.input, &mut self.output);
+        let extrema = self.output.trajectory.get_position_extrema();
+        let is_near = self.limits.iter().zip(extrema.iter()).all(|(joint, way)| {
+            let [lower, upper] = joint.position;
+            way.min >= lower - MAX_OUTSIDE && way.max <= upper + MAX_OUTSIDE
+        });
+        let is_stop = self.input.control_interface == ControlInterface::Velocity;
+        match result {
+            Ok(result) if is_near || is_stop => Some(result),
+            _ => {
+                (self.input.min_position, self.input.max_position) = ends;
+                None
+            }
+        }
+    }
+
     /// Where the joints are to be a cycle later.
     pub fn step(&mut self) -> Result<Setpoint, String> {
         if !self.is_held {
-            let result = self.ruckig.update(&self.input, &mut self.output).map_err(told)?;
+            let result = match self.ruckig.update(&self.input, &mut self.output) {
+                Err(why) => self.overshoot().ok_or_else(|| told(&why))?,
+                Ok(result) => result,
+            };
             self.output.pass_to_input(&mut self.input);
             if result == RuckigResult::Finished {
                 self.is_held = true;
@@ -151,7 +181,7 @@ fn list(numbers: impl Iterator<Item = f64>) -> DataArrayOrVec<f64, 0> {
     DataArrayOrVec::Heap(numbers.collect())
 }
 
-fn told(error: RuckigError) -> String {
+fn told(error: &RuckigError) -> String {
     format!("no way to the target was found: {error}")
 }
 
@@ -259,6 +289,33 @@ mod tests {
         assert!((way[way.len() - 1].position[0] - 0.9).abs() < 1e-9, "it heads for its target as before");
         let few = Setpoint { velocity: vec![0.0], ..found };
         assert!(generator.resume(&few).unwrap_err().contains("1 "));
+    }
+
+    #[test]
+    fn a_joint_too_fast_for_the_end_of_its_range_brakes_and_comes_back() {
+        let mut generator = at_rest();
+        generator.head_for(&JointTarget { position: vec![2.0, 0.2] }).unwrap();
+        let moving = |position| Setpoint {
+            position: vec![position, 0.2],
+            velocity: vec![0.4, 0.0],
+            acceleration: vec![-2.0, 0.0],
+        };
+        // From 0.4 rad/s it takes 0.045 rad to stop.
+        generator.resume(&moving(0.965)).unwrap();
+        let mut way = vec![moving(0.965)];
+        while !generator.is_held() {
+            way.push(generator.step().unwrap());
+        }
+        let farthest = way.iter().map(|setpoint| setpoint.position[0]).fold(0.0, f64::max);
+        assert!(farthest > 1.005 && farthest < 1.015, "{farthest}");
+        assert!((way[way.len() - 1].position[0] - 1.0).abs() < 1e-9);
+        assert!(way.iter().all(|setpoint| setpoint.acceleration[0].abs() < 2.0001));
+        generator.resume(&moving(0.999)).unwrap();
+        assert!(generator.step().unwrap_err().contains("no way"), "it would go too far");
+        generator.stop();
+        while !generator.is_held() {
+            generator.step().unwrap();
+        }
     }
 
     #[test]
