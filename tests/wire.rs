@@ -66,9 +66,7 @@ fn a_simulated_franka_rig_comes_through_its_drivers_and_is_moved() {
 
     let (code, told) = fieldrig(&["move", "--by", "panda_joint1=0.05", "--enable-motion", "--json"], &rig);
     assert_eq!(code, Some(0), "{told}");
-    let done = told.lines().find(|line| line.contains("\"event\":\"done\"")).expect("it arrives");
-    let error = done.split_once("\"error\":").and_then(|(_, rest)| rest.split([',', '}']).next()?.parse::<f64>().ok());
-    assert!(error.is_some_and(|error| error < 1e-3), "{done}");
+    assert!(compare::error_of_move(&told) < 1e-3, "{told}");
     let (code, told) = fieldrig(&["move", "--by", "panda_joint1=0.05", "--json"], &rig);
     assert_eq!(code, Some(2), "without a word that it may move it does not: {told}");
     drop(playing);

@@ -15,6 +15,8 @@ mod live;
 pub mod motion;
 #[cfg(feature = "nokhwa")]
 pub mod nokhwa;
+#[cfg(any(target_os = "linux", feature = "nokhwa", feature = "realsense"))]
+mod outage;
 pub mod realsense;
 pub mod recording;
 mod sample;

@@ -12,6 +12,13 @@ pub(crate) fn median(values: &[f64]) -> Option<f64> {
     }
 }
 
+/// The number that so large a share of sorted ones do not exceed. `None` of nothing.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "an index below the length")]
+pub(crate) fn quantile(sorted: &[f64], frac: f64) -> Option<f64> {
+    let ix = (frac * sorted.len() as f64).ceil() as usize;
+    sorted.get(ix.saturating_sub(1)).copied()
+}
+
 /// Smallest and largest value.
 pub(crate) fn extent(values: &[f64]) -> Option<[f64; 2]> {
     let first = *values.first()?;

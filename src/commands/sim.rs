@@ -39,20 +39,21 @@ fn seconds(text: &str) -> Result<f64, String> {
 }
 
 /// Simulates the rig, then plays it until Ctrl-C.
-#[cfg(all(feature = "sim", target_os = "linux"))]
+#[cfg(all(feature = "sim", feature = "realsense", target_os = "linux"))]
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     playing::run(args)
 }
 
 /// Simulates the rig, then plays it until Ctrl-C.
-#[cfg(not(all(feature = "sim", target_os = "linux")))]
+#[cfg(not(all(feature = "sim", feature = "realsense", target_os = "linux")))]
 pub(crate) fn run(_args: &Args) -> anyhow::Result<Exit> {
     anyhow::bail!(
-        "this program was built without the simulator: build it on Linux with `cargo build --release --features sim`"
+        "this program was built without the simulator or without RealSense cameras, whose files it plays: install the RealSense SDK, or \
+         run scripts/fetch-realsense.sh, and build it on Linux with `cargo build --release --features sim,realsense`"
     )
 }
 
 #[cfg(all(feature = "sim", feature = "realsense", target_os = "linux"))]
 mod bag;
-#[cfg(all(feature = "sim", target_os = "linux"))]
+#[cfg(all(feature = "sim", feature = "realsense", target_os = "linux"))]
 mod playing;

@@ -7,7 +7,7 @@ mod simulated;
 #[cfg(all(test, feature = "sim"))]
 mod simulated_tests;
 
-#[cfg(all(feature = "sim", target_os = "linux"))]
+#[cfg(all(feature = "sim", feature = "realsense", target_os = "linux"))]
 pub(crate) use real::{franka_chain, udp_arm_address};
 
 pub(crate) use real::movable_arm;

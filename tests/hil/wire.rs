@@ -56,9 +56,7 @@ fn the_mobile_arm_comes_through_its_drivers_and_is_moved() {
     let words = ["move", "/tmp/mobile/rig.toml", "--by", "panda_joint1=0.1", "--enable-motion", "--leave", "--json"];
     let (code, told) = fieldrig(&words);
     assert_eq!(code, Some(0), "{told}");
-    let done = told.lines().find(|line| line.contains("\"event\":\"done\"")).expect("it arrives");
-    let error = done.split_once("\"error\":").and_then(|(_, rest)| rest.split([',', '}']).next()?.parse::<f64>().ok());
-    assert!(error.is_some_and(|error| error < 0.01), "{done}");
+    assert!(compare::error_of_move(&told) < 0.01, "{told}");
     let _ = playing.kill(); // It plays until it is stopped.
     let _ = playing.wait();
 }

@@ -78,3 +78,10 @@ pub(super) fn difference(script: &Path, wire: &Path) -> Difference {
     joints_rad.sort_by(f64::total_cmp);
     Difference { n_images, joints_rad: [joints_rad[joints_rad.len() / 2], joints_rad[joints_rad.len() - 1]], base_m }
 }
+
+/// How far from its target `fieldrig move --json` says that the arm arrived, rad or m.
+pub(super) fn error_of_move(told: &str) -> f64 {
+    let done = told.lines().find(|line| line.contains("\"event\":\"done\"")).expect("it arrives");
+    let (_, rest) = done.split_once("\"error\":").expect("the key");
+    rest.split([',', '}']).next().and_then(|error| error.parse().ok()).expect("a number")
+}

@@ -3,6 +3,7 @@
 use super::gaps::Gaps;
 use super::worker::{Frame, Told, Worker};
 use super::{Config, Problem};
+use crate::outage::Outage;
 use crate::v4l2::Delivery;
 use crate::{Camera, Error, Image};
 use kinematics::Intrinsics;
@@ -38,13 +39,6 @@ pub struct NokhwaCamera {
     outage: Option<Outage>,
 }
 
-/// A time without images.
-#[derive(Clone, Copy, Debug)]
-struct Outage {
-    since: Instant,
-    n_tries: u32,
-}
-
 /// What became of the camera since it was opened.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
@@ -67,9 +61,7 @@ enum Link {
         quiet_since: Instant,
         streams: bool,
     },
-    Down {
-        last_try: Instant,
-    },
+    Down,
 }
 
 impl NokhwaCamera {
@@ -80,7 +72,7 @@ impl NokhwaCamera {
             name: config.name.as_str().into(),
             gaps: Gaps::new(config.rate_hz),
             config,
-            link: Link::Down { last_try: now },
+            link: Link::Down,
             counts: Counts::default(),
             left_behind: Vec::new(),
             outage: None,
@@ -176,18 +168,18 @@ impl NokhwaCamera {
 
     /// Leaves the thread to itself; whether that is for good it does not tell. Fails when the camera has been lost for too long.
     fn lose(&mut self, why: Problem) -> Result<(), Error> {
-        let now = Instant::now();
-        if let Link::Up { alive, .. } = std::mem::replace(&mut self.link, Link::Down { last_try: now })
+        if let Link::Up { alive, .. } = std::mem::replace(&mut self.link, Link::Down)
             && matches!(why, Problem::Hangs { .. })
         {
             self.counts.n_left_behind += 1;
             self.left_behind.push(alive);
         }
-        let Some(Outage { since, n_tries }) = self.outage else {
+        let is_new = self.outage.is_none();
+        let Outage { since, n_tries, .. } = Outage::of(&mut self.outage);
+        if is_new {
             log::warn!("camera {:?}: {why}; looking for it for {:?}", self.config.name, self.config.reconnect_for);
-            self.outage = Some(Outage { since: now, n_tries: 0 });
             return Ok(());
-        };
+        }
         let waited = since.elapsed();
         if waited < self.config.reconnect_for {
             log::debug!("camera {:?}: {why}", self.config.name);
@@ -198,13 +190,11 @@ impl NokhwaCamera {
 
     /// One try to open a lost camera again, not before the pause since the last one is over.
     fn reconnect(&mut self, deadline: Instant) -> Result<(), Error> {
-        let (Link::Down { last_try }, Some(outage)) = (&mut self.link, &mut self.outage) else { return Ok(()) };
-        let next_try = *last_try + if outage.n_tries == 0 { Duration::ZERO } else { RETRY_PAUSE };
-        std::thread::sleep(next_try.min(deadline).saturating_duration_since(Instant::now()));
-        if next_try > deadline {
+        let (Link::Down, Some(outage)) = (&self.link, &mut self.outage) else { return Ok(()) };
+        let pause = if outage.n_tries == 0 { Duration::ZERO } else { RETRY_PAUSE };
+        if !outage.try_again(pause, deadline) {
             return Ok(());
         }
-        outage.n_tries += 1;
         self.start().or_else(|problem| self.lose(problem))
     }
 }
@@ -222,7 +212,7 @@ impl Camera for NokhwaCamera {
         let deadline = Instant::now() + timeout;
         loop {
             match &self.link {
-                Link::Down { .. } => self.reconnect(deadline)?,
+                Link::Down => self.reconnect(deadline)?,
                 Link::Up { .. } => {
                     if let Some(image) = self.wait_for_image(deadline)? {
                         return Ok(image);
@@ -242,8 +232,7 @@ impl Camera for NokhwaCamera {
 
 impl Drop for NokhwaCamera {
     fn drop(&mut self) {
-        let Link::Up { worker, alive, .. } = std::mem::replace(&mut self.link, Link::Down { last_try: Instant::now() })
-        else {
+        let Link::Up { worker, alive, .. } = std::mem::replace(&mut self.link, Link::Down) else {
             return;
         };
         drop(worker);

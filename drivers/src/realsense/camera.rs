@@ -4,6 +4,7 @@ use super::find;
 use super::running::{Next, Running};
 use super::sdk::Context;
 use super::{Calibration, Config, Pace, Problem};
+use crate::outage::{Outage, n_between};
 use crate::{Camera, Error, Image};
 use kinematics::{Intrinsics, Stamp};
 use std::time::{Duration, Instant};
@@ -33,14 +34,6 @@ pub struct RealsenseCamera {
     outage: Option<Outage>,
 }
 
-/// A time without images.
-#[derive(Clone, Copy, Debug)]
-struct Outage {
-    since: Instant,
-    n_tries: u32,
-    n_resets: u32,
-}
-
 /// What became of the camera since it was opened.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
@@ -57,7 +50,7 @@ pub struct Counts {
 #[derive(Debug)]
 enum Link {
     Up(Box<Running>),
-    Down { last_try: Instant },
+    Down,
 }
 
 impl RealsenseCamera {
@@ -121,9 +114,8 @@ impl RealsenseCamera {
         if self.config.file.is_some() {
             return Err(Error::Realsense { camera: self.config.name.clone(), problem: Box::new(why) });
         }
-        let now = Instant::now();
-        let outage = *self.outage.get_or_insert(Outage { since: now, n_tries: 0, n_resets: 0 });
-        self.link = Link::Down { last_try: now };
+        let outage = Outage::of(&mut self.outage);
+        self.link = Link::Down;
         if outage.n_tries > 0 {
             return self.give_up_if_late(outage, why);
         }
@@ -132,7 +124,7 @@ impl RealsenseCamera {
     }
 
     /// The error of a camera that was lost for longer than the rig file allows.
-    fn give_up_if_late(&self, Outage { since, n_tries, n_resets }: Outage, why: Problem) -> Result<(), Error> {
+    fn give_up_if_late(&self, Outage { since, n_tries, n_resets, .. }: Outage, why: Problem) -> Result<(), Error> {
         let (camera, waited) = (self.config.name.clone(), since.elapsed());
         if waited < self.config.reconnect_for {
             log::debug!("camera {camera:?}: {why}");
@@ -144,15 +136,10 @@ impl RealsenseCamera {
 
     /// One try to open a lost camera again, not before the pause since the last one is over.
     fn reconnect(&mut self, deadline: Instant) -> Result<(), Error> {
-        let (Link::Down { last_try }, Some(outage)) = (&mut self.link, &mut self.outage) else { return Ok(()) };
-        let next_try = *last_try + RETRY_PAUSE;
-        if next_try > deadline {
-            std::thread::sleep(deadline.saturating_duration_since(Instant::now()));
+        let (Link::Down, Some(outage)) = (&self.link, &mut self.outage) else { return Ok(()) };
+        if !outage.try_again(RETRY_PAUSE, deadline) {
             return Err(Error::Reconnecting { camera: self.config.name.clone(), waited: outage.since.elapsed() });
         }
-        std::thread::sleep(next_try.saturating_duration_since(Instant::now()));
-        *last_try = Instant::now();
-        outage.n_tries += 1;
         if outage.n_tries.is_multiple_of(TRIES_BEFORE_RESET) && reset(&self.config) {
             outage.n_resets += 1;
             self.counts.n_resets += 1;
@@ -180,14 +167,6 @@ fn reset(config: &Config) -> bool {
     true
 }
 
-/// Images that a rate puts between two stamps.
-fn n_between(last: Stamp, next: Stamp, rate_hz: f64) -> u64 {
-    let periods = next.0.saturating_sub(last.0) as f64 * 1e-9 * rate_hz;
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the cast saturates, which is meant")]
-    let n_images = (periods.round() - 1.0).max(0.0) as u64;
-    n_images
-}
-
 impl Camera for RealsenseCamera {
     fn name(&self) -> &str {
         &self.config.name
@@ -201,7 +180,7 @@ impl Camera for RealsenseCamera {
         let deadline = Instant::now() + timeout;
         loop {
             match &self.link {
-                Link::Down { .. } => self.reconnect(deadline)?,
+                Link::Down => self.reconnect(deadline)?,
                 Link::Up(_) => {
                     if let Some(image) = self.wait_for_image(deadline)? {
                         return Ok(image);

@@ -2,6 +2,7 @@
 
 use super::running::Running;
 use super::{Config, Problem};
+use crate::outage::{Outage, n_between};
 use crate::{Camera, Error, Image};
 use kinematics::{Intrinsics, Stamp};
 use std::time::{Duration, Instant};
@@ -30,13 +31,6 @@ pub struct V4l2Camera {
     is_asked: bool,
 }
 
-/// A time without images.
-#[derive(Clone, Copy, Debug)]
-struct Outage {
-    since: Instant,
-    n_tries: u32,
-}
-
 /// What became of the camera since it was opened.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
@@ -53,7 +47,7 @@ pub struct Counts {
 #[derive(Debug)]
 enum Link {
     Up(Box<Running>),
-    Down { last_try: Instant },
+    Down,
 }
 
 impl V4l2Camera {
@@ -86,7 +80,7 @@ impl V4l2Camera {
     pub fn read_back(&self) -> &[(&'static str, i32)] {
         match &self.link {
             Link::Up(running) => running.read_back(),
-            Link::Down { .. } => &[],
+            Link::Down => &[],
         }
     }
 
@@ -132,9 +126,8 @@ impl V4l2Camera {
     /// Closes the device before it is looked for: a node in use keeps its number. Fails when it has been lost for too long: a camera
     /// that can be opened and sends nothing is lost, too.
     fn lose(&mut self, why: Problem) -> Result<(), Error> {
-        let now = Instant::now();
-        let outage = *self.outage.get_or_insert(Outage { since: now, n_tries: 0 });
-        self.link = Link::Down { last_try: now };
+        let outage = Outage::of(&mut self.outage);
+        self.link = Link::Down;
         if outage.n_tries > 0 {
             return self.give_up_if_late(outage, why);
         }
@@ -143,7 +136,7 @@ impl V4l2Camera {
     }
 
     /// The error of a camera that was lost for longer than the rig file allows.
-    fn give_up_if_late(&self, Outage { since, n_tries }: Outage, why: Problem) -> Result<(), Error> {
+    fn give_up_if_late(&self, Outage { since, n_tries, .. }: Outage, why: Problem) -> Result<(), Error> {
         let (camera, waited) = (self.config.name.clone(), since.elapsed());
         if waited < self.config.reconnect_for {
             log::debug!("camera {camera:?}: {why}");
@@ -154,20 +147,15 @@ impl V4l2Camera {
 
     /// One try to open a lost camera again, not before the pause since the last one is over.
     fn reconnect(&mut self, deadline: Instant) -> Result<(), Error> {
-        let (Link::Down { last_try }, Some(outage)) = (&mut self.link, &mut self.outage) else { return Ok(()) };
+        let (Link::Down, Some(outage)) = (&self.link, &mut self.outage) else { return Ok(()) };
         let pause = if outage.n_tries == 0 { Duration::ZERO } else { RETRY_PAUSE };
-        let next_try = *last_try + pause;
-        if next_try > deadline {
-            std::thread::sleep(deadline.saturating_duration_since(Instant::now()));
+        if !outage.try_again(pause, deadline) {
             return Err(Error::Reconnecting { camera: self.config.name.clone(), waited: outage.since.elapsed() });
         }
-        std::thread::sleep(next_try.saturating_duration_since(Instant::now()));
-        outage.n_tries += 1;
-        *last_try = Instant::now();
         let outage = *outage;
         match Running::start(&self.config) {
             Ok(running) => {
-                let Outage { since, n_tries } = outage;
+                let Outage { since, n_tries, .. } = outage;
                 let (camera, waited) = (&self.config.name, since.elapsed());
                 log::info!(
                     "camera {camera:?}: there again after {waited:?} and {n_tries} tries: {}",
@@ -183,14 +171,6 @@ impl V4l2Camera {
     }
 }
 
-/// Images that a rate puts between two stamps.
-fn n_between(last: Stamp, next: Stamp, rate_hz: f64) -> u64 {
-    let periods = next.0.saturating_sub(last.0) as f64 * 1e-9 * rate_hz;
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the cast saturates, which is meant")]
-    let n_images = (periods.round() - 1.0).max(0.0) as u64;
-    n_images
-}
-
 impl Camera for V4l2Camera {
     fn name(&self) -> &str {
         &self.config.name
@@ -204,7 +184,7 @@ impl Camera for V4l2Camera {
         let deadline = Instant::now() + timeout;
         loop {
             match &self.link {
-                Link::Down { .. } => self.reconnect(deadline)?,
+                Link::Down => self.reconnect(deadline)?,
                 Link::Up(_) => {
                     if let Some(image) = self.wait_for_image(deadline)? {
                         return Ok(image);
@@ -221,15 +201,6 @@ impl Camera for V4l2Camera {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn an_outage_is_counted_in_images() {
-        let millis = |millis: i64| Stamp(millis * 1_000_000);
-        assert_eq!(n_between(millis(0), millis(33), 30.0), 0);
-        assert_eq!(n_between(millis(0), millis(100), 30.0), 2);
-        assert_eq!(n_between(millis(0), millis(1000), 30.0), 29);
-        assert_eq!(n_between(millis(1000), millis(0), 30.0), 0);
-    }
 
     #[test]
     fn a_camera_that_is_not_plugged_in_is_an_error_that_names_it() {

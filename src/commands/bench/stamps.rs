@@ -1,6 +1,7 @@
 //! `fieldrig bench stamps`: how well the time of the shutter is found of images whose camera has a clock of its own and a bad cable.
 
 use crate::bench::page::{Findings, Table};
+use crate::bench::statistics::{median, quantile};
 use crate::chart::{Axis, Chart, Line, Point, Scale};
 use crate::exit::{BadArgument, Exit};
 use kinematics::{ClockMap, JointHistory, JointState, Stamp};
@@ -73,7 +74,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         for is_calibrated in [true, false] {
             // What the rig file says is taken off every stamp alike.
             let known = if is_calibrated { args.fixed_millis } else { 0.0 };
-            found.push(Found::of(*rate_hz, is_calibrated, errors.iter().map(|error| error - known).collect()));
+            let errors: Vec<f64> = errors.iter().map(|error| error - known).collect();
+            found.push(Found::of(*rate_hz, is_calibrated, &errors));
         }
     }
     std::fs::create_dir_all(&args.out)
@@ -144,16 +146,15 @@ fn uniform(state: &mut u64) -> f64 {
 
 impl Found {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped into the bars")]
-    fn of(rate_hz: f64, is_calibrated: bool, mut errors: Vec<f64>) -> Self {
+    fn of(rate_hz: f64, is_calibrated: bool, errors: &[f64]) -> Self {
         let n_bars = (2.0 * REACH_MILLIS / BIN_MILLIS).round() as usize;
         let mut bars = vec![0.0; n_bars];
         let n = errors.len();
-        for error in &errors {
+        for error in errors {
             let bar = ((error + REACH_MILLIS) / BIN_MILLIS).floor().max(0.0) as usize;
             bars[bar.min(n_bars - 1)] += 1.0 / n as f64;
         }
-        errors.sort_by(f64::total_cmp);
-        let median_millis = errors.get(n / 2).copied().unwrap_or(f64::NAN);
+        let median_millis = median(errors).unwrap_or(f64::NAN);
         let mut sizes: Vec<f64> = errors.iter().map(|error| error.abs()).collect();
         sizes.sort_by(f64::total_cmp);
         Self {
@@ -162,8 +163,8 @@ impl Found {
             images: n,
             within_1_ms_frac: sizes.partition_point(|size| *size <= CLOSE_MILLIS) as f64 / n as f64,
             median_millis,
-            p99_abs_millis: sizes.get(n * 99 / 100).copied().unwrap_or(f64::NAN),
-            worst_abs_millis: sizes.last().copied().unwrap_or(f64::NAN),
+            p99_abs_millis: quantile(&sizes, 0.99).unwrap_or(f64::NAN),
+            worst_abs_millis: quantile(&sizes, 1.0).unwrap_or(f64::NAN),
             bars,
         }
     }
@@ -250,10 +251,10 @@ mod tests {
     fn shutters_are_found_to_a_millisecond_once_the_fixed_part_is_known() {
         let args = Flags::parse_from(["stamps", "--rates", "30", "--seeds", "3"]).args;
         let errors: Vec<f64> = (1..=3).flat_map(|seed| errors_millis(&args, 30.0, seed)).collect();
-        let known = Found::of(30.0, true, errors.iter().map(|error| error - 5.0).collect());
+        let known = Found::of(30.0, true, &errors.iter().map(|error| error - 5.0).collect::<Vec<_>>());
         assert_eq!(known.within_1_ms_frac, 1.0, "{known:?}");
         assert!((known.bars.iter().sum::<f64>() - 1.0).abs() < 1e-9);
-        let unknown = Found::of(30.0, false, errors);
+        let unknown = Found::of(30.0, false, &errors);
         assert!((unknown.median_millis - 5.0).abs() < 0.5 && unknown.within_1_ms_frac == 0.0, "{unknown:?}");
     }
 

@@ -1,6 +1,7 @@
 //! What a rig's devices truly deliver: each is read for a while with the drivers of `run`, nothing is moved.
 
 use super::Finding;
+use crate::bench::statistics::quantile;
 use crate::config::{BaseDriver, Rig};
 use crate::join::{Join, JoinEvent};
 use crate::open::{self, Devices, Opened};
@@ -61,6 +62,7 @@ impl Track {
             (Some(first), Some(last)) => last.secs_since(*first),
             _ => 0.0,
         };
+        let share = |sorted: &[f64], frac| quantile(sorted, frac).unwrap_or(0.0);
         let n_gaps = self.stamps.len().saturating_sub(1);
         Delivered {
             device,
@@ -74,13 +76,6 @@ impl Track {
             gap_p99_millis: share(&gaps, 0.99),
         }
     }
-}
-
-/// The number that so large a share of sorted ones do not exceed; 0 of none.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "an index below the length")]
-fn share(sorted: &[f64], frac: f64) -> f64 {
-    let ix = (frac * sorted.len() as f64).ceil() as usize;
-    sorted.get(ix.saturating_sub(1)).copied().unwrap_or(0.0)
 }
 
 /// Reads the rig's devices for so many seconds, or until Ctrl-C.

@@ -1,69 +1,65 @@
 //! The images of a recording as files of a RealSense camera.
 
 use crate::config::{Camera, CameraDriver, Rig};
-use crate::open;
-use crate::print;
 use anyhow::Context;
 use drivers::realsense::Pace;
 use drivers::realsense::played::{BagWriter, PlayedCamera, PlayedDepth};
-use drivers::{Image, PixelFormat, Sample};
-use kinematics::Stamp;
+use drivers::{Image, PixelFormat};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// The files of a rig's cameras, while they are written.
+pub(super) struct Films {
+    films: Vec<Film>,
+}
 
 /// A camera of the rig, and its file once its first images told what they are.
-struct Film<'a> {
-    camera: &'a Camera,
+struct Film {
+    camera: Camera,
     path: PathBuf,
     /// Colour and depth that came before the other was seen.
     waiting: Vec<Image>,
     writer: Option<BagWriter>,
 }
 
-/// Writes a file for each RealSense camera of the rig, and has the rig play it.
-pub(super) fn write(
-    rig: &mut Rig,
-    recording: &Path,
-    secs: f64,
-    folder: &Path,
-    as_json: bool,
-) -> anyhow::Result<Vec<String>> {
-    let is_its = |camera: &&Camera| camera.driver == CameraDriver::Realsense;
-    let path = |camera: &Camera| folder.join(format!("{}.bag", camera.name));
-    let mut films: Vec<_> = rig
-        .cameras
-        .iter()
-        .filter(is_its)
-        .map(|camera| Film { camera, path: path(camera), waiting: Vec::new(), writer: None })
-        .collect();
-    if films.is_empty() {
-        return Ok(Vec::new());
+impl Films {
+    /// One for each RealSense camera of the rig.
+    pub(super) fn new(rig: &Rig, folder: &Path) -> anyhow::Result<Self> {
+        let folder = std::path::absolute(folder).context("the folder of the cameras' files")?;
+        let film = |camera: &Camera| Film {
+            camera: camera.clone(),
+            path: folder.join(format!("{}.bag", camera.name)),
+            waiting: Vec::new(),
+            writer: None,
+        };
+        let is_its = |camera: &&Camera| camera.driver == CameraDriver::Realsense;
+        Ok(Self { films: rig.cameras.iter().filter(is_its).map(film).collect() })
     }
-    let mut source = open::recording(recording, None, &[])?.source;
-    let bar = print::bar(None, "{spinner} {elapsed} {msg}", as_json);
-    let mut first: Option<Stamp> = None;
-    while let Some(sample) = source.next_sample()? {
-        let since = sample.stamp().secs_since(*first.get_or_insert(sample.stamp()));
-        if since > secs {
-            break;
-        }
-        if let Sample::Image(image) = sample
-            && let Some(film) = films.iter_mut().find(|film| film.camera.name == image.camera)
-        {
-            film.take(image)?;
-            bar.set_message(format!("{since:.1} of {secs:.1} s of images written"));
+
+    /// Takes an image; those of other cameras are not played.
+    pub(super) fn take(&mut self, image: Image) -> anyhow::Result<()> {
+        match self.films.iter_mut().find(|film| film.camera.name == image.camera) {
+            Some(film) => film.take(image),
+            None => Ok(()),
         }
     }
-    bar.finish_and_clear();
-    let told = films.iter().map(|film| format!("camera {:?}: {}", film.camera.name, film.path.display())).collect();
-    films.into_iter().try_for_each(Film::finish)?;
-    for camera in rig.cameras.iter_mut().filter(|camera| camera.driver == CameraDriver::Realsense) {
-        camera.realsense.file = std::path::absolute(path(camera)).context("the folder of the cameras' files")?;
-        camera.realsense.pace = Pace::Clock;
+
+    /// Ends the files and has the rig play them, by the clock; a sentence for each comes back.
+    pub(super) fn finish(self, rig: &mut Rig) -> anyhow::Result<Vec<String>> {
+        let mut told = Vec::new();
+        for film in self.films {
+            let (name, path) = (Arc::clone(&film.camera.name), film.path.clone());
+            film.finish()?;
+            told.push(format!("camera {name:?}: {}", path.display()));
+            for camera in rig.cameras.iter_mut().filter(|camera| camera.name == name) {
+                (camera.realsense.file, camera.realsense.pace) = (path.clone(), Pace::Clock);
+            }
+        }
+        Ok(told)
     }
-    Ok(told)
 }
 
-impl Film<'_> {
+impl Film {
     fn take(&mut self, image: Image) -> anyhow::Result<()> {
         let image = if image.is_depth() {
             image
@@ -83,7 +79,7 @@ impl Film<'_> {
 
     /// Begins the file as soon as an image of each kind has come.
     fn begin(&mut self) -> anyhow::Result<()> {
-        let Camera { name, rate_hz, intrinsics, depth, .. } = self.camera;
+        let Camera { name, rate_hz, intrinsics, depth, .. } = &self.camera;
         let counts = self.waiting.iter().find_map(|image| match image.format {
             PixelFormat::DepthU16 { metres_per_count } => Some(metres_per_count),
             _ => None,

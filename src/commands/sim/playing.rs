@@ -1,7 +1,8 @@
 //! From a rig file to its devices on the wire.
 
 use super::Args;
-use crate::config::{ArmDriver, BaseDriver, CameraDriver, Rig, ScannerDriver};
+use super::bag::Films;
+use crate::config::{ArmDriver, BaseDriver, Rig, ScannerDriver};
 use crate::exit::{BadArgument, Exit};
 use crate::open::{self, Devices, Opened};
 use crate::print;
@@ -9,7 +10,7 @@ use crate::stop::Stop;
 use anyhow::{Context, bail};
 use drivers::franka::FciVersion;
 use drivers::franka::played::{Limits, PlayedRobot, RobotConfig};
-use drivers::{can, clock};
+use drivers::{Sample, can, clock};
 use kinematics::{Stamp, Transform};
 use serde::Serialize;
 use sim::wire::{Clockwork, JointTrack, Listeners, PlayedMotors, PlayedSenders, Script, play_fci};
@@ -59,8 +60,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
             None => return Ok(Exit::Done),
         },
     };
-    let script = script(&recording, args.seconds)?;
-    let mut told = films(&mut rig, &recording, args, &folder)?;
+    let mut films = Films::new(&rig, &folder)?;
+    let Some(script) = read(&recording, args, &mut films, &stop)? else { return Ok(Exit::Done) };
+    let mut told = films.finish(&mut rig)?;
     let first = script.joints.first().map(|state| state.stamp);
     let first = first.or(script.poses.first().map(|pose| pose.stamp)).unwrap_or_default();
     let clockwork = Clockwork { scripted: first, played: clock::now().plus_secs(args.start_in) };
@@ -102,28 +104,8 @@ fn load(what: &str) -> anyhow::Result<(String, Rig)> {
     Ok((name, Rig::load(path, &[])?))
 }
 
-/// Writes what RealSense cameras play.
-#[cfg(feature = "realsense")]
-fn films(rig: &mut Rig, recording: &Path, args: &Args, folder: &Path) -> anyhow::Result<Vec<String>> {
-    super::bag::write(rig, recording, args.seconds, folder, args.json)
-}
-
-#[cfg(not(feature = "realsense"))]
-#[expect(clippy::unnecessary_wraps, reason = "with these cameras it can fail")]
-fn films(_rig: &mut Rig, _recording: &Path, _args: &Args, _folder: &Path) -> anyhow::Result<Vec<String>> {
-    Ok(Vec::new())
-}
-
 /// Refuses a rig that cannot be played, before a minute is spent on simulating it.
 fn check(rig: &Rig) -> Result<(), BadArgument> {
-    let film = rig.cameras.iter().find(|camera| camera.driver == CameraDriver::Realsense);
-    if let (Some(camera), false) = (film, cfg!(feature = "realsense")) {
-        return Err(BadArgument(format!(
-            "camera {:?}: this program was built without RealSense cameras: install the RealSense SDK (or run \
-             scripts/fetch-realsense.sh) and build it with `cargo build --release --features sim,realsense`",
-            camera.name
-        )));
-    }
     if rig.arm.driver == ArmDriver::Sim {
         return Err(BadArgument(
             "arm.driver is sim: `fieldrig run` plays such an arm itself; on the wire are franka, can and udp"
@@ -158,18 +140,28 @@ fn simulate(args: &Args, rig: &Rig, folder: &Path, stop: &Stop) -> anyhow::Resul
     Ok(Some(path))
 }
 
-/// What the devices of a recording say but for its cameras, in its first `secs`.
-fn script(recording: &Path, secs: f64) -> anyhow::Result<Script> {
+/// What the devices of a recording say in its first seconds; images go to the cameras' files. `None` where that was interrupted.
+fn read(recording: &Path, args: &Args, films: &mut Films, stop: &Stop) -> anyhow::Result<Option<Script>> {
     let mut source = open::recording(recording, None, &[])?.source;
+    let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
     let mut script = Script::default();
     let mut first: Option<Stamp> = None;
     while let Some(sample) = source.next_sample()? {
-        if sample.stamp().secs_since(*first.get_or_insert(sample.stamp())) > secs {
+        let secs = sample.stamp().secs_since(*first.get_or_insert(sample.stamp()));
+        if secs > args.seconds {
             break;
         }
-        script.take(sample);
+        if stop.asked() {
+            return Ok(None);
+        }
+        bar.set_message(format!("{secs:.1} of {:.1} s made ready", args.seconds));
+        match sample {
+            Sample::Image(image) => films.take(image)?,
+            other => script.take(other),
+        }
     }
-    Ok(script)
+    bar.finish_and_clear();
+    Ok(Some(script))
 }
 
 /// The rig file that runs against what is played, the robot's description beside it.
@@ -291,9 +283,11 @@ mod tests {
             for (camera, on_wire) in plain.cameras.iter_mut().zip(&wire.cameras) {
                 camera.driver = on_wire.driver;
                 camera.stamp_to_mid_exposure = on_wire.stamp_to_mid_exposure.clone();
+                // What such a camera tells itself the file leaves out.
+                camera.realsense = on_wire.realsense.clone();
             }
-            assert_eq!(plain, wire, "{name}");
-            assert_eq!(Rig::load(&rigs.join(format!("wire/{name}.toml")), &[]).expect("the same file"), wire);
+            assert!(plain == wire, "{name}");
+            assert!(Rig::load(&rigs.join(format!("wire/{name}.toml")), &[]).expect("the same file") == wire);
         }
     }
 

@@ -1,0 +1,73 @@
+//! A camera that was lost: since when, how often it was looked for, when the next try is due. The same for all drivers of cameras.
+
+use kinematics::Stamp;
+use std::time::{Duration, Instant};
+
+/// A time without images.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Outage {
+    pub(crate) since: Instant,
+    pub(crate) n_tries: u32,
+    /// Times that the camera was reset meanwhile, where its driver can do that.
+    pub(crate) n_resets: u32,
+    last_try: Instant,
+}
+
+impl Outage {
+    /// The outage of a camera that is lost now: the one that goes on, or a new one.
+    pub(crate) fn of(outage: &mut Option<Self>) -> Self {
+        let now = Instant::now();
+        let outage = outage.get_or_insert(Self { since: now, n_tries: 0, n_resets: 0, last_try: now });
+        outage.last_try = now;
+        *outage
+    }
+
+    /// Waits for the next try, which is due a pause after the last one, and counts it. False where it is not due before the deadline,
+    /// which is waited for.
+    pub(crate) fn try_again(&mut self, pause: Duration, deadline: Instant) -> bool {
+        let next_try = self.last_try + pause;
+        std::thread::sleep(next_try.min(deadline).saturating_duration_since(Instant::now()));
+        if next_try > deadline {
+            return false;
+        }
+        self.n_tries += 1;
+        self.last_try = Instant::now();
+        true
+    }
+}
+
+/// Images that a rate puts between two stamps.
+pub(crate) fn n_between(last: Stamp, next: Stamp, rate_hz: f64) -> u64 {
+    let periods = next.0.saturating_sub(last.0) as f64 * 1e-9 * rate_hz;
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the cast saturates, which is meant")]
+    let n_images = (periods.round() - 1.0).max(0.0) as u64;
+    n_images
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_outage_is_counted_in_images() {
+        let millis = |millis: i64| Stamp(millis * 1_000_000);
+        assert_eq!(n_between(millis(0), millis(33), 30.0), 0);
+        assert_eq!(n_between(millis(0), millis(100), 30.0), 2);
+        assert_eq!(n_between(millis(0), millis(1000), 30.0), 29);
+        assert_eq!(n_between(millis(1000), millis(0), 30.0), 0);
+    }
+
+    #[test]
+    fn a_try_waits_for_its_pause_and_never_past_the_deadline() {
+        let mut lost = None;
+        let mut outage = Outage::of(&mut lost);
+        assert!(outage.try_again(Duration::ZERO, Instant::now()), "the first may be due at once");
+        let began = Instant::now();
+        assert!(!outage.try_again(Duration::from_secs(60), began + Duration::from_millis(10)));
+        assert!(began.elapsed() >= Duration::from_millis(10) && began.elapsed() < Duration::from_secs(30));
+        assert!(outage.try_again(Duration::from_millis(20), began + Duration::from_secs(60)));
+        assert!(began.elapsed() >= Duration::from_millis(15));
+        assert_eq!(outage.n_tries, 2);
+        assert_eq!(Outage::of(&mut lost).since, outage.since, "it goes on");
+    }
+}
