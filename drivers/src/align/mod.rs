@@ -6,8 +6,12 @@
 //! (`src/proc/sse/sse-align.cpp`) rounds half a pixel further to the right and down, and takes the upper left corner alone
 //! where colour has fewer pixels per angle than depth; we follow the plain path.
 
+mod cover;
+
 use crate::{Error, Image, PixelFormat};
+use cover::{Canvas, Covered};
 use kinematics::{Intrinsics, Lens, Transform};
+use std::sync::Arc;
 
 /// Moves depth images of one camera into the pixels of another; what does not change between images is worked out once.
 #[derive(Clone, Debug)]
@@ -38,13 +42,6 @@ enum ColorLens {
     KannalaBrandt([f32; 4]),
 }
 
-/// First and last column and row that each pixel of one row of depth covers, cut to the image; counted from 1, so that 0 is
-/// before the image. Where a first one is behind a last one nothing is covered.
-struct Covered {
-    first: [Vec<u16>; 2],
-    last: [Vec<u16>; 2],
-}
-
 /// Which corner of each pixel of one row of depth.
 #[derive(Clone, Copy)]
 enum Corner {
@@ -66,11 +63,38 @@ struct View {
 
 /// Room for the work on one row of depth.
 struct Row {
-    /// Depth along z, in units of one count.
-    counts: Vec<f32>,
+    /// Depth along z.
+    counts: Vec<u16>,
+    /// The same.
+    numbers: Vec<f32>,
     /// Columns and rows in the colour image, pixels.
     positions_px: [Vec<f32>; 2],
     covered: Covered,
+}
+
+/// What is done with vector instructions.
+struct Task<'a> {
+    alignment: &'a DepthAlignment,
+    /// Two bytes each, the lower one first.
+    counts: &'a [u8],
+    metres_per_count: f64,
+}
+
+impl pulp::NullaryFnOnce for Task<'_> {
+    type Output = Arc<[u8]>;
+
+    #[inline(always)]
+    fn call(self) -> Arc<[u8]> {
+        let aligned = self.alignment.align_counts(self.counts.as_chunks().0, self.metres_per_count);
+        let mut data: Arc<[u8]> = std::iter::repeat_n(0, 2 * aligned.len()).collect();
+        let bytes = Arc::get_mut(&mut data).expect("nobody else has it yet");
+        for (bytes, less_one) in bytes.as_chunks_mut::<2>().0.iter_mut().zip(aligned) {
+            let count = less_one.wrapping_add(1);
+            // The largest count says nothing either.
+            *bytes = if count == u16::MAX { [0; 2] } else { count.to_le_bytes() };
+        }
+        data
+    }
 }
 
 impl DepthAlignment {
@@ -108,45 +132,40 @@ impl DepthAlignment {
                 expected_px: self.depth_px,
             });
         }
-        let counts: Vec<u16> =
-            depth.raw_bytes()?.as_chunks::<2>().0.iter().map(|&bytes| u16::from_le_bytes(bytes)).collect();
-        let aligned = self.align_counts(&counts, metres_per_count);
-        let mut data = vec![0; 2 * aligned.len()];
-        for (bytes, less_one) in data.as_chunks_mut::<2>().0.iter_mut().zip(aligned) {
-            let count = less_one.wrapping_add(1);
-            // The largest count says nothing either.
-            *bytes = if count == u16::MAX { [0; 2] } else { count.to_le_bytes() };
-        }
-        Ok(Image { size_px: self.color.size_px, data: data.into(), ..depth.clone() })
+        // The same code for every set of vector instructions; the widest that this computer has runs.
+        let task = Task { alignment: self, counts: depth.raw_bytes()?, metres_per_count };
+        let data = pulp::Arch::new().dispatch(task);
+        Ok(Image { size_px: self.color.size_px, data, ..depth.clone() })
     }
 
     /// The nearest count less one of each colour pixel: so 0, which says nothing, is the largest number and never stays.
-    fn align_counts(&self, counts: &[u16], metres_per_count: f64) -> Vec<u16> {
-        let [width, height] = self.color.size_px.map(|side| side as usize);
-        let mut aligned = vec![u16::MAX; width * height];
+    #[inline(always)]
+    fn align_counts(&self, counts: &[[u8; 2]], metres_per_count: f64) -> Vec<u16> {
         let depth_width = self.depth_px[0] as usize;
+        let mut canvas = Canvas::new(self.color.size_px.map(|side| side as usize), depth_width);
         let cells = || [vec![0; depth_width], vec![0; depth_width]];
         let mut work = Row {
-            counts: vec![0.0; depth_width],
+            counts: vec![0; depth_width],
+            numbers: vec![0.0; depth_width],
             positions_px: [vec![0.0; depth_width], vec![0.0; depth_width]],
             covered: Covered { first: cells(), last: cells() },
         };
         // In units of one count, so that counts need no factor.
         let depth_in_color = self.depth_in_color.map(|metres| narrow(metres / metres_per_count));
         for (row_ix, row) in counts.chunks_exact(depth_width.max(1)).enumerate() {
-            for (number, count) in work.counts.iter_mut().zip(row) {
-                *number = f32::from(*count);
-            }
+            work.counts.iter_mut().zip(row).for_each(|(count, bytes)| *count = u16::from_le_bytes(*bytes));
+            work.numbers.iter_mut().zip(&work.counts).for_each(|(number, count)| *number = f32::from(*count));
             let first_corner = row_ix * (depth_width + 1);
             self.project(&mut work, depth_in_color, first_corner, Corner::First);
             // The opposite corners lie one row and one column on.
             self.project(&mut work, depth_in_color, first_corner + depth_width + 2, Corner::Last);
-            cover(&mut aligned, width, row, &work.covered);
+            canvas.put(&work.counts, &work.covered);
         }
-        aligned
+        canvas.into_nearest()
     }
 
     /// Colour pixels, column and row, where the corners of a row are seen; `start` is the place of the first among all.
+    #[inline(always)]
     fn project(&self, work: &mut Row, depth_in_color: [f32; 3], start: usize, corner: Corner) {
         let view = View {
             depth_in_color,
@@ -159,7 +178,7 @@ impl DepthAlignment {
         };
         let reach2 = self.color.reach2;
         let [columns, rows] = &mut work.positions_px;
-        let counts = &work.counts;
+        let counts = &work.numbers;
         let rays = [0, 1, 2].map(|axis| &self.corners[axis][start..]);
         match self.color.lens {
             ColorLens::Pinhole => project_by(columns, rows, counts, rays, &view, |x, y| ([x, y], true)),
@@ -209,6 +228,7 @@ fn project_by(
 
 /// Numbers of the pixels at some positions, from 1 on, cut to the image and one number behind it ([`Corner::First`]) or before it.
 #[expect(clippy::cast_possible_truncation, reason = "the low 16 bits are the number")]
+#[inline(always)]
 fn number(numbers: &mut [u16], positions_px: &[f32], side: u32, corner: Corner) {
     // Numbers have 16 bits: larger images get no depth beyond.
     let side = side.min(u32::from(u16::MAX) - 1) as f32;
@@ -226,32 +246,6 @@ fn number(numbers: &mut [u16], positions_px: &[f32], side: u32, corner: Corner) 
         let nearest = (from_one + WHOLE) - WHOLE;
         let below = nearest - if nearest > from_one { 1.0 } else { 0.0 };
         *number = (below + WHOLE).to_bits() as u16;
-    }
-}
-
-/// Puts the counts of one row of depth, less one, where they are nearer than what is there.
-fn cover(aligned: &mut [u16], width: usize, row: &[u16], covered: &Covered) {
-    let Covered { first: [left, top], last: [right, bottom] } = covered;
-    let corners = left.iter().zip(top).zip(right.iter().zip(bottom));
-    for (&count, ((&left, &top), (&right, &bottom))) in row.iter().zip(corners) {
-        if left > right || top > bottom {
-            continue;
-        }
-        let less_one = count.wrapping_sub(1);
-        // First ones are 1 at least.
-        let [left, right, top, bottom] = [left, right, top, bottom].map(|number| usize::from(number) - 1);
-        for line in top..=bottom {
-            let line = &mut aligned[line * width..][..width];
-            if right - left < 3 {
-                // Most squares are this small. All three are written, the same or not: a wrong guess of how many there are
-                // costs more.
-                let columns = [left, (left + 1).min(right), right];
-                let nearest = columns.map(|column| line[column].min(less_one));
-                columns.into_iter().zip(nearest).for_each(|(column, nearest)| line[column] = nearest);
-            } else {
-                line[left..=right].iter_mut().for_each(|nearest| *nearest = less_one.min(*nearest));
-            }
-        }
     }
 }
 
@@ -405,7 +399,9 @@ mod tests {
         let fisheye = Lens::KannalaBrandt([-0.01, 0.02, -0.015, 0.003]);
         let d455 = Lens::BrownConrady([-0.0555, 0.0657, -0.0006, 0.0004, -0.0213]);
         for (depth_lens, color_lens) in [(Lens::Pinhole, Lens::Pinhole), (Lens::Pinhole, d455), (d455, fisheye)] {
-            for (color_px, focal_px) in [([320, 240], 300.0), ([640, 360], 455.0), ([160, 120], 140.0)] {
+            // As large as a square is wide at most: 2, 4, 7 and 2 columns, the last with several squares to a column.
+            let cameras = [([320, 240], 300.0), ([640, 360], 455.0), ([1280, 720], 1000.0), ([160, 120], 140.0)];
+            for (color_px, focal_px) in cameras {
                 let (depth, color) = (camera(size_px, 190.0, depth_lens), camera(color_px, focal_px, color_lens));
                 let alignment = DepthAlignment::new(&depth, &color, &beside());
                 let got = counts(&alignment.align(&image(size_px, &scene)).expect("depth"));
