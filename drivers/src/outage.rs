@@ -8,8 +8,6 @@ use std::time::{Duration, Instant};
 pub(crate) struct Outage {
     pub(crate) since: Instant,
     pub(crate) n_tries: u32,
-    /// Times that the camera was reset meanwhile, where its driver can do that.
-    pub(crate) n_resets: u32,
     last_try: Instant,
 }
 
@@ -17,7 +15,7 @@ impl Outage {
     /// The outage of a camera that is lost now: the one that goes on, or a new one.
     pub(crate) fn of(outage: &mut Option<Self>) -> Self {
         let now = Instant::now();
-        let outage = outage.get_or_insert(Self { since: now, n_tries: 0, n_resets: 0, last_try: now });
+        let outage = outage.get_or_insert(Self { since: now, n_tries: 0, last_try: now });
         outage.last_try = now;
         *outage
     }

@@ -32,6 +32,8 @@ pub struct RealsenseCamera {
     last: [Option<Stamp>; 2],
     /// Set from a loss to the next image.
     outage: Option<Outage>,
+    /// Resets since it was lost.
+    n_resets: u32,
 }
 
 /// What became of the camera since it was opened.
@@ -66,6 +68,7 @@ impl RealsenseCamera {
             counts: Counts::default(),
             last: [None; 2],
             outage: None,
+            n_resets: 0,
         })
     }
 
@@ -103,7 +106,7 @@ impl RealsenseCamera {
         if let (true, Some(last)) = (is_first_again, last) {
             image.n_skipped = image.n_skipped.max(n_between(last, image.stamp, self.config.rate_hz));
         }
-        self.outage = None;
+        (self.outage, self.n_resets) = (None, 0);
         self.counts.n_images += 1;
         self.counts.n_skipped += image.n_skipped;
         image
@@ -124,13 +127,13 @@ impl RealsenseCamera {
     }
 
     /// The error of a camera that was lost for longer than the rig file allows.
-    fn give_up_if_late(&self, Outage { since, n_tries, n_resets, .. }: Outage, why: Problem) -> Result<(), Error> {
+    fn give_up_if_late(&self, Outage { since, n_tries, .. }: Outage, why: Problem) -> Result<(), Error> {
         let (camera, waited) = (self.config.name.clone(), since.elapsed());
         if waited < self.config.reconnect_for {
             log::debug!("camera {camera:?}: {why}");
             return Ok(());
         }
-        let problem = Problem::Lost { waited, n_tries, n_resets, last: Box::new(why) };
+        let problem = Problem::Lost { waited, n_tries, n_resets: self.n_resets, last: Box::new(why) };
         Err(Error::Realsense { camera, problem: Box::new(problem) })
     }
 
@@ -141,7 +144,7 @@ impl RealsenseCamera {
             return Err(Error::Reconnecting { camera: self.config.name.clone(), waited: outage.since.elapsed() });
         }
         if outage.n_tries.is_multiple_of(TRIES_BEFORE_RESET) && reset(&self.config) {
-            outage.n_resets += 1;
+            self.n_resets += 1;
             self.counts.n_resets += 1;
             return Ok(());
         }
