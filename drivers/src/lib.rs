@@ -20,6 +20,9 @@ mod outage;
 pub mod realsense;
 pub mod recording;
 mod sample;
+pub mod tags;
+#[cfg(test)]
+mod test_data;
 pub mod udp;
 pub mod v4l2;
 pub mod wire;

@@ -37,7 +37,9 @@ pub mod wire;
 /// Where things are in the scenes, for whoever checks pictures and scans of them.
 pub mod layout {
     pub use crate::lab::{PEDESTAL_HALF_M, ROOM_HALF_M, ROOM_HEIGHT_M};
-    pub use crate::objects::{BLOCK_HALF_M, CUBE_HALF_M, TABLE_Z_M, TARGET_XY_M, world_from_block, world_from_cube};
+    pub use crate::objects::{
+        BLOCK_HALF_M, CUBE_HALF_M, TABLE_Z_M, TARGET_XY_M, world_from_block, world_from_cube, world_from_tag,
+    };
 }
 
 pub use config::{

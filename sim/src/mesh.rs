@@ -207,7 +207,7 @@ impl Mesh {
 }
 
 /// Outward, right and up directions of a box's faces in the order +x, -x, +y, -y, +z, -z; sides stand upright.
-const BOX_FACES: [([f64; 3], [f64; 3], [f64; 3]); 6] = [
+pub(crate) const BOX_FACES: [([f64; 3], [f64; 3], [f64; 3]); 6] = [
     ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]),
     ([-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]),
     ([0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]),

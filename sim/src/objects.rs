@@ -1,11 +1,11 @@
 //! What stands in the static-arm scene: meshes, textures with the light painted in, and where everything is.
 
 use crate::light::Blockers;
-use crate::mesh::{Mesh, WHOLE};
+use crate::mesh::{BOX_FACES, Mesh, WHOLE};
 use crate::texture::{self, Texture};
 use crate::toy;
 use kinematics::Transform;
-use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 
 /// Height of the table top above the robot's base, metres.
 pub const TABLE_Z_M: f64 = 0.12;
@@ -35,6 +35,16 @@ fn on_table(x_m: f64, y_m: f64, above_m: f64, yaw_degrees: f64) -> Transform {
 /// Pose of the tag cube's centre. Its sides +x, -x, +y, -y, +z, -z carry the tags 0 to 5.
 pub fn world_from_cube() -> Transform {
     on_table(-0.035, 0.062, CUBE_HALF_M, 28.0)
+}
+
+/// Pose of a tag on the cube, by its number, 0 to 5: x to the right of the print, y down, z into it.
+pub fn world_from_tag(id: usize) -> Transform {
+    let (outward, right, up) = BOX_FACES[id];
+    let [outward, right, up] = [outward, right, up].map(Vector3::from);
+    let axes = Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[right, -up, -outward]));
+    let cube_from_tag =
+        Transform::from_parts(Translation3::from(outward * CUBE_HALF_M), UnitQuaternion::from_rotation_matrix(&axes));
+    world_from_cube() * cube_from_tag
 }
 
 /// Pose of the wooden block's centre.

@@ -18,8 +18,10 @@ pub(crate) use write::methods;
 use crate::method::Kind;
 use drivers::can::{BusConfig, MotorConfig};
 use drivers::realsense::{Filter, Pace, Stream};
+use drivers::tags::{Family, PlacedTag};
 use drivers::v4l2::{Delivery, V4l2Format};
 use kinematics::{Intrinsics, Transform};
+use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
@@ -94,6 +96,12 @@ pub(crate) struct Base {
     pub(crate) rate_hz: f64,
     /// Whether its pose is estimated anew at each stand.
     pub(crate) realign: bool,
+    /// Poses that are less sure are passed over, metres and radians.
+    pub(crate) max_sigma_m: f64,
+    pub(crate) max_sigma_rad: f64,
+    /// The tags that the driver `tags` looks for, by their numbers in the family.
+    pub(crate) tag_family: Family,
+    pub(crate) tags: BTreeMap<u32, PlacedTag>,
     /// Error of a simulated base's poses at the end of its walk, root mean square, metres and radians.
     pub(crate) drift_m: f64,
     pub(crate) drift_rad: f64,

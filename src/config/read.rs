@@ -8,9 +8,11 @@ use super::{
 };
 use crate::method::Kind;
 use drivers::realsense::{Filter, Pace, Stream};
+use drivers::tags::{Family, PlacedTag};
 use drivers::v4l2::{Delivery, V4l2Format};
 use kinematics::{Chain, Intrinsics, Lens, Transform};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use toml::{Table, Value};
 
@@ -27,6 +29,13 @@ pub(super) const BASE_DRIVERS: [(&str, BaseDriver); 5] = [
     ("rgbd", BaseDriver::Rgbd),
     ("udp", BaseDriver::Udp),
     ("sim", BaseDriver::Sim),
+];
+pub(super) const TAG_FAMILIES: [(&str, Family); 5] = [
+    ("tag36h11", Family::Tag36h11),
+    ("tag25h9", Family::Tag25h9),
+    ("tag16h5", Family::Tag16h5),
+    ("tagStandard41h12", Family::Standard41h12),
+    ("tagStandard52h13", Family::Standard52h13),
 ];
 pub(super) const CAMERA_DRIVERS: [(&str, CameraDriver); 4] = [
     ("realsense", CameraDriver::Realsense),
@@ -184,20 +193,44 @@ fn arm(mut keys: Section<'_>) -> (Arm, String) {
 }
 
 fn base(mut keys: Section<'_>) -> Base {
+    let tags: BTreeMap<_, _> = keys.named_sections("tag").into_iter().filter_map(|(id, keys)| tag(&id, keys)).collect();
     let mut flaws = keys.section("sim");
     let (drift_m, drift_rad) = (flaws.number("drift_m", 0.0..=10.0), flaws.number("drift_rad", 0.0..=1.0));
     flaws.end();
+    let driver = keys.choice("driver", &BASE_DRIVERS).unwrap_or(BaseDriver::Fixed);
+    if driver == BaseDriver::Tags && tags.is_empty() {
+        keys.missing("tag", "a table [base.tag.ID] for each tag: its size_m and world_from_tag");
+    }
     let base = Base {
-        driver: keys.choice("driver", &BASE_DRIVERS).unwrap_or(BaseDriver::Fixed),
+        driver,
         address: keys.address("address").unwrap_or(USUAL_BASE_ADDRESS),
         world_from_base: pose(&mut keys, "world_from_base").unwrap_or_else(Transform::identity),
         rate_hz: keys.number("rate_hz", 1.0..=1000.0).unwrap_or(100.0),
         realign: keys.flag("realign").unwrap_or(true),
+        max_sigma_m: keys.number("max_sigma_m", 0.0001..=100.0).unwrap_or(0.05),
+        max_sigma_rad: keys.number("max_sigma_rad", 0.0001..=3.2).unwrap_or(0.03),
+        tag_family: keys.choice("tag_family", &TAG_FAMILIES).unwrap_or(Family::Tag36h11),
+        tags,
         drift_m: drift_m.unwrap_or(0.02),
         drift_rad: drift_rad.unwrap_or(0.0175),
     };
     keys.end();
     base
+}
+
+/// A tag with its number; `None` where something is wrong, which has been told.
+fn tag(id: &str, mut keys: Section<'_>) -> Option<(u32, PlacedTag)> {
+    let id = id
+        .parse()
+        .ok()
+        .or_else(|| keys.wrong("id", &Value::from(id), "the number of a tag in its family, as the table's name"));
+    let size_m = keys.number("size_m", 0.001..=10.0);
+    if size_m.is_none() {
+        keys.missing("size_m", "the side of the tag's border, where black meets white, m");
+    }
+    let world_from_tag = pose(&mut keys, "world_from_tag").unwrap_or_else(Transform::identity);
+    keys.end();
+    Some((id?, PlacedTag { size_m: size_m?, world_from_tag }))
 }
 
 fn scanner(name: &str, mut keys: Section<'_>) -> Scanner {

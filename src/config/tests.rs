@@ -59,6 +59,8 @@ id = 3
 counts_per_turn = 65536
 [arm.motion]
 on_loss = "release"
+[base.tag.7]
+size_m = 0.1
 "#;
 
 fn parse(text: &str, overrides: &[Override]) -> Result<Rig, ConfigError> {
@@ -71,7 +73,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a good value that differs from the one in force, and a value that is not allowed.
-const KEYS: [(&str, &str, &str); 156] = [
+const KEYS: [(&str, &str, &str); 162] = [
     ("arm.rate_hz", "500", "0"),
     ("arm.bus.can0.bitrate_hz", "500_000", "1"),
     ("arm.bus.can0.data_bitrate_hz", "5_000_000", "9_000_000"),
@@ -114,6 +116,12 @@ const KEYS: [(&str, &str, &str); 156] = [
     ("base.world_from_base.quat_xyzw", "[1, 0, 0, 0]", "[1, 1, 0, 0]"),
     ("base.rate_hz", "50", "0"),
     ("base.realign", "false", "1"),
+    ("base.max_sigma_m", "0.01", "0"),
+    ("base.max_sigma_rad", "0.01", "7"),
+    ("base.tag_family", "'tag25h9'", "'tag37h11'"),
+    ("base.tag.7.size_m", "0.2", "0"),
+    ("base.tag.7.world_from_tag.xyz_m", "[1, 0, 0]", "[1, 0]"),
+    ("base.tag.7.world_from_tag.quat_xyzw", "[0, 1, 0, 0]", "[0, 0, 0, 0]"),
     ("base.sim.drift_m", "0.1", "-0.1"),
     ("base.sim.drift_rad", "0.05", "2"),
     ("range.lidar.driver", "'sim'", "'laser'"),
@@ -284,7 +292,7 @@ fn the_documentation_lists_exactly_the_keys_there_are() {
     let tested: BTreeSet<String> = KEYS
         .iter()
         .map(|(key, ..)| {
-            let names = ["camera.wrist", "range.lidar", "arm.bus.can0"];
+            let names = ["camera.wrist", "range.lidar", "arm.bus.can0", "base.tag.7"];
             let motors = ["arm.motor.first", "arm.motor.second", "arm.motor.third"];
             names.iter().chain(&motors).fold((*key).to_owned(), |key, named| {
                 let (table, _) = named.rsplit_once('.').expect("two parts");

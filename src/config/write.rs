@@ -2,9 +2,11 @@
 
 use super::read::{
     ARM_DRIVERS, BASE_DRIVERS, CAMERA_DRIVERS, DELIVERIES, FILTERS, PACES, PARENTS, SCANNER_DRIVERS, STREAMS,
+    TAG_FAMILIES,
 };
 use super::{Arm, Base, Camera, CameraSim, Depth, JoinConfig, Realsense, Rig, Scanner, Sim, Train, Unknown, V4l2};
 use crate::method::Kind;
+use drivers::tags::PlacedTag;
 use kinematics::{Intrinsics, Lens, Transform};
 use toml::{Table, Value};
 
@@ -62,6 +64,8 @@ fn arm(arm: &Arm) -> Table {
 }
 
 fn base(base: &Base) -> Table {
+    let tag = |tag: &PlacedTag| table([("size_m", is(tag.size_m)), ("world_from_tag", pose(&tag.world_from_tag))]);
+    let tags: Table = base.tags.iter().map(|(id, placed)| (id.to_string(), Value::Table(tag(placed)))).collect();
     let sim = table([("drift_m", is(base.drift_m)), ("drift_rad", is(base.drift_rad))]);
     table([
         ("driver", name_of(&BASE_DRIVERS, &base.driver)),
@@ -69,6 +73,10 @@ fn base(base: &Base) -> Table {
         ("world_from_base", pose(&base.world_from_base)),
         ("rate_hz", is(base.rate_hz)),
         ("realign", is(base.realign)),
+        ("max_sigma_m", is(base.max_sigma_m)),
+        ("max_sigma_rad", is(base.max_sigma_rad)),
+        ("tag_family", name_of(&TAG_FAMILIES, &base.tag_family)),
+        ("tag", (!tags.is_empty()).then_some(Value::Table(tags))),
         ("sim", Some(Value::Table(sim))),
     ])
 }

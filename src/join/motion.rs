@@ -12,9 +12,11 @@ use trainer::BasePlace;
 
 /// Readings kept: 20 s at 1 kHz, more than any image waits.
 const MAX_READINGS: usize = 20_000;
+/// Images of a camera between whose poses by tags the base's pose is interpolated: one may be without.
+const MAX_IMAGES_BETWEEN: f64 = 2.5;
 
 /// The robot's recent motion.
-pub(super) struct Motion {
+pub(crate) struct Motion {
     chain: Chain,
     /// Where each joint of the chain stands in the readings.
     order: Vec<usize>,
@@ -40,8 +42,8 @@ struct Told {
 
 /// A camera's pose and velocity at a stamp.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Posed {
-    pub(super) world_from_camera: Transform,
+pub(crate) struct Posed {
+    pub(crate) world_from_camera: Transform,
     pub(super) twist: Option<Twist>,
     /// Of the camera for each joint of the chain that moves by a radian or metre; none where no joint carries the camera.
     pub(super) joint_twists: Arc<[Twist]>,
@@ -50,15 +52,19 @@ pub(super) struct Posed {
 }
 
 impl Motion {
-    pub(super) fn new(rig: &Rig) -> anyhow::Result<Self> {
+    pub(crate) fn new(rig: &Rig) -> anyhow::Result<Self> {
         let chain =
             Chain::from_urdf(&rig.arm.urdf_text, &rig.arm.base_link, &rig.arm.flange_link).context("the arm's URDF")?;
         let order = chain.order_in(&rig.arm.joints).context("arm.joints")?;
         let max_gap = Duration::from_secs_f64(rig.join.max_gap_millis * 1e-3);
+        // Tags tell where the base is in each image, and not between.
+        let slowest_hz = rig.cameras.iter().map(|camera| camera.rate_hz).fold(f64::INFINITY, f64::min);
+        let between_images = Duration::from_secs_f64(MAX_IMAGES_BETWEEN / slowest_hz.max(1.0));
+        let max_base_gap = if rig.base.driver == BaseDriver::Tags { max_gap.max(between_images) } else { max_gap };
         let base = match rig.base.driver {
             BaseDriver::Fixed => BaseMotion::Fixed(rig.base.world_from_base),
             BaseDriver::Tags | BaseDriver::Rgbd | BaseDriver::Udp | BaseDriver::Sim => {
-                let poses = || PoseHistory::new(max_gap, MAX_READINGS);
+                let poses = || PoseHistory::new(max_base_gap, MAX_READINGS);
                 BaseMotion::Told(Box::new(Told { poses: poses(), standing: Standing::default(), truth: poses() }))
             }
         };
@@ -67,7 +73,7 @@ impl Motion {
     }
 
     /// Takes joint readings in the order of the device; says whether they made sense.
-    pub(super) fn push_joints(&mut self, state: JointState) -> bool {
+    pub(crate) fn push_joints(&mut self, state: JointState) -> bool {
         let ordered = |numbers: &[f64]| -> Option<Vec<f64>> {
             if numbers.is_empty() {
                 return Some(Vec::new());
@@ -115,7 +121,7 @@ impl Motion {
     }
 
     /// A camera at a stamp; `NotYet` when the readings do not reach so far.
-    pub(super) fn at(&self, camera: &config::Camera, stamp: Stamp) -> Result<Posed, HistoryError> {
+    pub(crate) fn at(&self, camera: &config::Camera, stamp: Stamp) -> Result<Posed, HistoryError> {
         let (world_from_base, base_twist, base) = match &self.base {
             BaseMotion::Fixed(pose) => (*pose, Twist::zero(), None),
             BaseMotion::Told(told) if camera.parent != Parent::World => {

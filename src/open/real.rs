@@ -38,7 +38,7 @@ pub(super) fn open(rig: &mut Rig) -> anyhow::Result<Devices> {
         ArmDriver::Udp => Some(udp_arm(rig)?),
     };
     if rig.base.driver == BaseDriver::Udp {
-        let base = UdpBase::open(rig.base.address)?;
+        let base = UdpBase::open(rig.base.address, [rig.base.max_sigma_m, rig.base.max_sigma_rad])?;
         log::info!("base: listening on {}", base.address());
         devices.base = Some(Box::new(base) as Box<dyn Base>);
     }

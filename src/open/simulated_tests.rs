@@ -4,6 +4,7 @@ use super::{Devices, Opened};
 use crate::config::{Override, Rig};
 use crate::join::{Join, JoinEvent};
 use crate::stands::Stands;
+use drivers::tags::{Family, Spotter};
 use drivers::wire::datagram::{Clock, Head, PoseDatagram, ScanPart, encode_pose, encode_scan};
 use drivers::{RangePoint, Sample};
 use kinematics::Transform;
@@ -232,7 +233,9 @@ fn what_comes_over_the_network_is_placed_recorded_and_replayed() {
             for seq in 0.. {
                 let head = Head { seq, clock: Clock::Monotonic, stamp_nanos: drivers::clock::now().0 };
                 let world_from_base = Transform::translation(0.5, 0.0, 0.0);
-                socket.send_to(&encode_pose(&PoseDatagram { head, world_from_base }), to_base).expect("loopback");
+                socket
+                    .send_to(&encode_pose(&PoseDatagram { head, world_from_base, covariance: None }), to_base)
+                    .expect("loopback");
                 if seq % 10 == 0 {
                     let part = ScanPart { head, frame: "lidar".into(), part: 0, n_parts: 1, points: vec![POINT] };
                     socket.send_to(&encode_scan(&part), to_lidar).expect("loopback");
@@ -314,4 +317,80 @@ fn a_base_that_drifts_on_its_way_is_found_again_live_and_from_its_recording() {
     let [before, after] = [worst(&told), worst(&first)];
     assert!(before[0] > 0.015 && before[1] > 0.005, "{before:?} m and rad to begin with");
     assert!(after[0] < LEFT_M && after[1] < LEFT_RAD, "{after:?} m and rad left: {:?}", stands.reports());
+}
+
+#[test]
+fn tags_tell_where_a_base_stands_that_nobody_measured() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/tags.toml");
+    let overrides = [Override::new("sim.lockstep", true), Override::new("sim.n_images", 40)];
+    let rig = Rig::load(&path, &overrides).expect("a rig file that comes along");
+    for (id, tag) in &rig.base.tags {
+        let truth = sim::layout::world_from_tag(*id as usize);
+        let off = tag.world_from_tag.inverse() * truth;
+        assert!(off.translation.vector.norm() < 1e-6 && off.rotation.angle() < 1e-6, "tag {id}: {off}");
+    }
+    let mut told = Vec::new();
+    let (keyframes, join) = keyframes(super::rig(rig, Devices::Sim).expect("the simulator"), |sample| {
+        if let Sample::Base(pose) = sample {
+            told.push(pose.world_from_base);
+        }
+    });
+    assert!(told.len() >= 20, "{}", told.len());
+    let mut off: Vec<[f64; 2]> =
+        told.iter().map(|pose| [pose.translation.vector.norm(), pose.rotation.angle()]).collect();
+    off.sort_by(|a, b| a[0].total_cmp(&b[0]));
+    eprintln!(
+        "{} poses; base off by {:?} in the median, {:?} at worst",
+        off.len(),
+        off[off.len() / 2],
+        off[off.len() - 1]
+    );
+    let last = &told[told.len() - 1];
+    assert!(last.translation.vector.norm() < 3e-3 && last.rotation.angle() < 5e-3, "{last}");
+    assert!(off[off.len() / 2][0] < 5e-3, "{off:?}");
+    assert!(keyframes.len() >= 8, "{}", join.counts());
+    let worst = keyframes.iter().filter_map(|keyframe| {
+        let truth = keyframe.truth.as_ref()?;
+        Some((keyframe.world_from_camera.inverse() * truth.world_from_camera).translation.vector.norm())
+    });
+    let worst = worst.fold(0.0, f64::max);
+    assert!(worst > 0.0 && worst < 2e-2, "{worst} m");
+}
+
+#[test]
+fn corners_of_tags_are_seen_where_the_simulator_puts_them() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
+    let overrides = [Override::new("sim.lockstep", true), Override::new("sim.n_images", 12)];
+    let rig = Rig::load(&path, &overrides).expect("a rig file that comes along");
+    let mut spotter = Spotter::start(Family::Tag36h11).expect("a thread");
+    let mut source = super::rig(rig.clone(), Devices::Sim).expect("the simulator").source;
+    let (mut sightings, mut off_px) = (Vec::new(), Vec::new());
+    while let Some(sample) = source.next_sample().expect("the rig works") {
+        match sample {
+            Sample::Image(image) if !image.is_depth() => {
+                sightings.extend(spotter.look_now(image).into_iter().map(|sighting| sighting.expect("an image")));
+            }
+            Sample::Truth(truth) => {
+                let Some(ix) = sightings.iter().position(|sighting| sighting.stamp == truth.image.stamp) else {
+                    continue;
+                };
+                for tag in sightings.swap_remove(ix).tags {
+                    let camera_from_tag =
+                        truth.world_from_camera.inverse() * sim::layout::world_from_tag(tag.id as usize);
+                    let corners = [[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]];
+                    for ([x, y], seen) in corners.into_iter().zip(tag.corners_px) {
+                        let corner = camera_from_tag * nalgebra::Point3::new(0.024 * x, 0.024 * y, 0.0);
+                        let at = rig.cameras[0].intrinsics.project(&corner.coords).expect("before the camera");
+                        off_px.push([seen[0] - at[0], seen[1] - at[1]]);
+                    }
+                }
+            }
+            _ => {}
+        }
+    }
+    let n = off_px.len() as f64;
+    let mean = [0, 1].map(|axis| off_px.iter().map(|off| off[axis]).sum::<f64>() / n);
+    let spread = (off_px.iter().map(|[x, y]| x * x + y * y).sum::<f64>() / n).sqrt();
+    // Half a pixel would be a corner counted from the middle of the first one.
+    assert!(n >= 40.0 && mean.iter().all(|off| off.abs() < 0.2) && spread < 0.8, "{n}: {mean:?}, {spread} px");
 }

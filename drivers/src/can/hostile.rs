@@ -184,7 +184,7 @@ pub(crate) mod tests {
                 questions.push(Frame::classic(Id::standard(motor.into()).unwrap(), &[0; 8]).unwrap());
             }
             let mut answers: Vec<Frame> = questions.iter().flat_map(|frame| played.take(frame).unwrap()).collect();
-            answers.extend(played.report(Stamp(0) + Duration::from_millis(20) * cycle.into()).unwrap());
+            answers.extend(played.report(Stamp(0) + Duration::from_millis(20) * u32::from(cycle)).unwrap());
             told.extend(answers.iter().filter_map(|frame| heard.read(frame)));
             said.extend(questions);
             said.extend(answers);

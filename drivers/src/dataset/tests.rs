@@ -1,6 +1,7 @@
 //! Reading of dataset folders: real ones, and small ones written here.
 
 use super::*;
+use crate::test_data;
 use image::{ExtendedColorType, GrayImage, Luma, RgbImage};
 use kinematics::{Lens, Stamp};
 use nalgebra::{Point3, Vector3};
@@ -8,16 +9,6 @@ use serde_json::{Value, json};
 
 /// Positions written with a dozen digits.
 const EXACT_M: f64 = 1e-9;
-
-fn shared(name: &str) -> Option<PathBuf> {
-    let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
-    let folder = std::env::var_os("FIELDRIG_TEST_DATA").map_or_else(beside, PathBuf::from).join(name);
-    if !folder.is_dir() {
-        eprintln!("skipped: no test data at {}", folder.display());
-        return None;
-    }
-    Some(folder)
-}
 
 fn identity_rows() -> Value {
     json!([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -54,7 +45,7 @@ fn complaint(folder: &tempfile::TempDir) -> String {
 
 #[test]
 fn fox_is_read_without_the_photos_that_do_not_exist() {
-    let Some(folder) = shared("fox") else { return };
+    let Some(folder) = test_data::folder("fox") else { return };
     let dataset = read(&folder).unwrap();
     assert_eq!((dataset.frames.len(), dataset.n_missing, dataset.n_unusable), (50, 17, 0));
     assert!(dataset.notes[0].starts_with("17 images are not there: "), "{:?}", dataset.notes);
@@ -76,7 +67,7 @@ fn fox_is_read_without_the_photos_that_do_not_exist() {
 
 #[test]
 fn redkitchen_has_depth_in_metres() {
-    let Some(folder) = shared("redkitchen") else { return };
+    let Some(folder) = test_data::folder("redkitchen") else { return };
     let dataset = read(&folder).unwrap();
     assert_eq!((dataset.frames.len(), dataset.n_missing, dataset.notes.len()), (50, 0, 0));
     let depth = dataset.frames[10].load().unwrap().depth.unwrap();

@@ -15,6 +15,8 @@ pub struct Counts {
     pub n_late: u64,
     /// That gave way to newer ones because nobody took them.
     pub n_dropped: u64,
+    /// Poses that their sender is less sure of than the rig file asks.
+    pub n_unsure: u64,
     /// How often the sender began to count anew.
     pub n_restarts: u64,
 }
@@ -31,11 +33,11 @@ pub(super) fn tell(device: &str, n: &mut u64, more: u64, what: impl fmt::Display
 impl Counts {
     /// Logs what went wrong, if anything did.
     pub(super) fn summarize(&self, device: &str) {
-        let Self { n_received, n_refused, n_lost, n_late, n_dropped, n_restarts } = self;
-        if [n_refused, n_lost, n_late, n_dropped, n_restarts].iter().any(|n| **n > 0) {
+        let Self { n_received, n_refused, n_lost, n_late, n_dropped, n_unsure, n_restarts } = self;
+        if [n_refused, n_lost, n_late, n_dropped, n_unsure, n_restarts].iter().any(|n| **n > 0) {
             log::warn!(
                 "{device}: of {n_received} datagrams {n_refused} were refused, {n_late} came late or twice, {n_dropped} gave way \
-                 to newer ones; {n_lost} scans, poses or parts were lost; the sender began anew {n_restarts} times"
+                 to newer ones, {n_unsure} were too unsure; {n_lost} scans, poses or parts were lost; the sender began anew {n_restarts} times"
             );
         }
     }

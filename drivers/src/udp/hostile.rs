@@ -69,8 +69,9 @@ pub(crate) fn joint_states(bytes: &[u8]) -> Vec<Vec<f64>> {
                 assert!(numbers.into_iter().all(|number| number.abs() <= FAR), "{state:?}");
                 told.push(state.position);
             }
-            let decode =
-                |bytes: &[u8]| decode_pose(bytes).map(|PoseDatagram { head, world_from_base }| (head, world_from_base));
+            let decode = |bytes: &[u8]| {
+                decode_pose(bytes).map(|PoseDatagram { head, world_from_base, .. }| (head, world_from_base))
+            };
             if let Some((stamp, pose)) = base.take(&arrived, decode) {
                 assert_grows(&mut newest[1], stamp, at);
                 assert!(pose.translation.vector.amax() <= FAR, "{pose:?}");
@@ -114,7 +115,7 @@ pub(crate) mod tests {
             lines.push(encode_joints(&joints, &names));
             let head = Head { clock: Clock::Device, ..head };
             let world_from_base = Transform::translation(0.1 * f64::from(seq), 0.0, 0.5);
-            lines.push(encode_pose(&PoseDatagram { head, world_from_base }));
+            lines.push(encode_pose(&PoseDatagram { head, world_from_base, covariance: None }));
             let point = RangePoint { position_m: [1.0, -2.0, 0.5], ring: 3, offset_micros: 7 };
             let head = Head { seq: u64::from(seq / 2), stamp_nanos: i64::from(seq / 2) * 6_000_000, ..head };
             let part = ScanPart { head, frame: "lidar".to_owned(), part: seq % 2, n_parts: 2, points: vec![point; 2] };

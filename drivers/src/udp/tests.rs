@@ -13,6 +13,8 @@ use std::time::{Duration, Instant};
 const PATIENCE: Duration = Duration::from_secs(20);
 /// For what does not come.
 const SHORT: Duration = Duration::from_millis(150);
+/// Of poses that are taken, metres and radians.
+const MAX_SIGMA: [f64; 2] = [0.05, 0.03];
 const FREE_PORT: &str = "127.0.0.1:0";
 
 fn sender(to: SocketAddr) -> impl Fn(&[u8]) {
@@ -41,7 +43,7 @@ fn ranges(scanner: &mut UdpScanner) -> Vec<f32> {
 }
 
 fn pose(head: Head, x_m: f64) -> Vec<u8> {
-    encode_pose(&PoseDatagram { head, world_from_base: Transform::translation(x_m, 0.0, 0.0) })
+    encode_pose(&PoseDatagram { head, world_from_base: Transform::translation(x_m, 0.0, 0.0), covariance: None })
 }
 
 #[test]
@@ -126,7 +128,7 @@ fn nonsense_is_refused_and_stops_nothing() {
 
 #[test]
 fn base_poses_come_in_order_and_the_port_is_free_again() {
-    let mut base = UdpBase::open(FREE_PORT.parse().unwrap()).unwrap();
+    let mut base = UdpBase::open(FREE_PORT.parse().unwrap(), MAX_SIGMA).unwrap();
     let (address, send) = (base.address(), sender(base.address()));
     assert!(matches!(base.next_pose(SHORT), Err(Error::NoBasePose { .. })));
     let heads: Vec<Head> = (0..4).map(now).collect();
@@ -140,10 +142,34 @@ fn base_poses_come_in_order_and_the_port_is_free_again() {
     assert!(base.next_pose(SHORT).is_err());
     let expected = Counts { n_received: 5, n_lost: 1, n_late: 2, ..Counts::default() };
     assert_eq!(base.counts(), expected);
-    let taken = UdpBase::open(address).unwrap_err();
+    let taken = UdpBase::open(address, MAX_SIGMA).unwrap_err();
     assert!(taken.to_string().contains(&address.to_string()), "{taken}");
     drop(base);
-    UdpBase::open(address).unwrap();
+    UdpBase::open(address, MAX_SIGMA).unwrap();
+}
+
+#[test]
+fn poses_that_their_sender_is_not_sure_of_are_passed_over_and_counted() {
+    let mut base = UdpBase::open(FREE_PORT.parse().unwrap(), MAX_SIGMA).unwrap();
+    let send = sender(base.address());
+    let head: Vec<Head> = (0..5).map(now).collect();
+    let told = |ix: usize, sigma_m: f64, sigma_rad: f64| {
+        let mut covariance = Box::new([0.0; 36]);
+        (covariance[0], covariance[28]) = (sigma_m * sigma_m, sigma_rad * sigma_rad);
+        let world_from_base = Transform::translation(ix as f64, 0.0, 0.0);
+        encode_pose(&PoseDatagram { head: head[ix], world_from_base, covariance: Some(covariance) })
+    };
+    let [max_m, max_rad] = MAX_SIGMA;
+    send(&told(0, 0.9 * max_m, 0.9 * max_rad));
+    send(&told(1, 1.1 * max_m, 0.0));
+    send(&told(2, 0.0, 1.1 * max_rad));
+    send(&pose(head[3], 3.0));
+    for ix in [0, 3] {
+        assert_eq!(base.next_pose(PATIENCE).unwrap().world_from_base.translation.x, f64::from(ix));
+    }
+    send(&told(4, 1.0, 0.0));
+    assert!(base.next_pose(SHORT).is_err());
+    assert_eq!(base.counts(), Counts { n_received: 5, n_unsure: 3, ..Counts::default() });
 }
 
 #[test]
@@ -173,7 +199,7 @@ fn joint_states_come_in_order_and_those_of_other_joints_are_refused() {
 #[test]
 fn live_merges_both_and_names_the_one_that_falls_silent() {
     let (scanner, send_scan) = scanner();
-    let base = UdpBase::open(FREE_PORT.parse().unwrap()).unwrap();
+    let base = UdpBase::open(FREE_PORT.parse().unwrap(), MAX_SIGMA).unwrap();
     let send_pose = sender(base.address());
     let devices = Devices { base: Some(Box::new(base)), scanners: vec![Box::new(scanner)], ..Devices::default() };
     let mut live = Live::new(devices).unwrap();

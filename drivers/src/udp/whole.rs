@@ -17,7 +17,7 @@ pub(super) struct WholeReadings {
     plural: &'static str,
     receiver: Receiver,
     pub(super) order: Order,
-    counts: Counts,
+    pub(super) counts: Counts,
 }
 
 impl WholeReadings {

@@ -62,6 +62,18 @@ pub struct PoseDatagram {
     pub head: Head,
     /// Pose of the base.
     pub world_from_base: Transform,
+    /// Covariance of the pose where the sender tells it, row by row: position along the world's axes, then small turns about them
+    /// (as in `geometry_msgs/PoseWithCovariance` of ROS); m², m rad, rad².
+    pub covariance: Option<Box<[f64; 36]>>,
+}
+
+impl PoseDatagram {
+    /// How sure the sender is, where it tells: root mean squares of the position's error and of the turn's, metres and radians.
+    pub fn sigmas(&self) -> Option<[f64; 2]> {
+        let covariance = self.covariance.as_ref()?;
+        let trace = |first: usize| (first..first + 3).map(|ix| covariance[7 * ix]).sum::<f64>();
+        Some([trace(0).sqrt(), trace(3).sqrt()])
+    }
 }
 
 /// What an arm's joints did.
@@ -120,6 +132,8 @@ struct WirePose {
     clock: Clock,
     stamp_nanos: i64,
     world_from_base: Pose,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    covariance: Option<Vec<f64>>,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -177,7 +191,7 @@ pub fn encode_scan(part: &ScanPart) -> Vec<u8> {
 
 /// A base's pose as a datagram; every bit of it comes back from [`decode_pose`].
 pub fn encode_pose(pose: &PoseDatagram) -> Vec<u8> {
-    let PoseDatagram { head, world_from_base } = pose;
+    let PoseDatagram { head, world_from_base, covariance } = pose;
     let wire = WirePose {
         kind: POSE.to_owned(),
         version: VERSION,
@@ -188,6 +202,7 @@ pub fn encode_pose(pose: &PoseDatagram) -> Vec<u8> {
             xyz_m: world_from_base.translation.vector.into(),
             quat_xyzw: world_from_base.rotation.coords.into(),
         },
+        covariance: covariance.as_ref().map(|covariance| covariance.to_vec()),
     };
     serde_json::to_vec(&wire).expect("numbers and lists always serialize")
 }
@@ -264,7 +279,18 @@ pub fn decode_pose(bytes: &[u8]) -> Result<PoseDatagram, Malformed> {
     Ok(PoseDatagram {
         head: Head { seq: wire.seq, clock: wire.clock, stamp_nanos: wire.stamp_nanos },
         world_from_base: Transform::from_parts(Translation3::new(x, y, z), rotation),
+        covariance: wire.covariance.map(covariance).transpose()?,
     })
+}
+
+fn covariance(numbers: Vec<f64>) -> Result<Box<[f64; 36]>, Malformed> {
+    let n = numbers.len();
+    let covariance: Box<[f64; 36]> =
+        numbers.try_into().map_err(|_| amiss(format!("covariance has {n} numbers, not 36")))?;
+    match (0..6).all(|ix| (0.0..=FAR_M).contains(&covariance[7 * ix])) {
+        true => Ok(covariance),
+        false => Err(amiss(format!("covariance has a variance outside 0 to {FAR_M}"))),
+    }
 }
 
 /// Reads the state of joints of these names; a sender that names them must name the same in the same order.
@@ -372,7 +398,8 @@ mod tests {
     fn pose() -> PoseDatagram {
         let rotation = UnitQuaternion::from_euler_angles(0.1, -0.2, 3.0);
         let world_from_base = Transform::from_parts(Translation3::new(0.1, -1.0 / 3.0, 1e3), rotation);
-        PoseDatagram { head: Head { clock: Clock::Device, ..HEAD }, world_from_base }
+        let covariance = Some(Box::new(std::array::from_fn(|ix| 1e-4 * (1 + ix) as f64)));
+        PoseDatagram { head: Head { clock: Clock::Device, ..HEAD }, world_from_base, covariance }
     }
 
     fn names() -> Vec<String> {
@@ -449,6 +476,9 @@ mod tests {
             (r#""stamp_nanos":"#, r#""stamp_nanos":1e99,"x":"#, "floating point"),
             (r#""quat_xyzw":["#, r#""quat_xyzw":[0,0,0,0],"x":["#, "length 1"),
             (r#""xyz_m":["#, r#""xyz_m":[0,-1e300,0],"x":["#, "beyond"),
+            (r#""covariance":["#, r#""covariance":[1],"x":["#, "36"),
+            (r#""covariance":["#, r#""covariance":[-1],"x":["#, "36"),
+            (r#""covariance":[0.0001"#, r#""covariance":[-0.0001"#, "variance outside"),
         ] {
             assert!(other.contains(from), "{from}");
             let told = decode_pose(other.replace(from, to).as_bytes()).expect_err(to).to_string();

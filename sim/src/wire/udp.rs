@@ -181,7 +181,10 @@ impl Sender {
     fn send_pose(&mut self, ix: usize, stamp: Stamp) {
         let Some(to) = self.listeners.base else { return };
         let world_from_base = self.script.poses[ix].world_from_base;
-        self.send(&encode_pose(&PoseDatagram { head: head(self.n_poses_sent, stamp), world_from_base }), to);
+        self.send(
+            &encode_pose(&PoseDatagram { head: head(self.n_poses_sent, stamp), world_from_base, covariance: None }),
+            to,
+        );
         self.n_poses_sent += 1;
     }
 
@@ -236,7 +239,7 @@ mod tests {
         let names: Vec<String> = vec!["a".into(), "b".into()];
         let free = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
         let mut arm = UdpArm::open(&names, free).expect("a free port");
-        let mut base = UdpBase::open(free).expect("a free port");
+        let mut base = UdpBase::open(free, [1.0; 2]).expect("a free port");
         let mut scanner = UdpScanner::open("lidar", free).expect("a free port");
         let played = clock::now().plus_secs(0.2);
         let listeners = Listeners {

@@ -1,0 +1,205 @@
+//! Tags in images, found in a thread of its own.
+
+use crate::{Error, Image};
+use apriltag::families::Family as Code;
+use apriltag::{Detector, Image as Gray};
+use kinematics::Stamp;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+
+/// Wrong cells that are mended. With two or more, noise is taken for a tag now and then (Olson 2011, section V.B).
+const MENDED_CELLS: usize = 1;
+/// Mean difference in grey between the cells of a tag and the threshold of its code below which it is none. AprilTag's authors call
+/// less than 10 noise; a tag that is hardly seen is not worth its corners.
+const MIN_MARGIN: f32 = 20.0;
+/// From this many pixels on, squares are looked for at half the resolution; corners are refined at the whole.
+const MANY_PX: usize = 1_000_000;
+
+/// Which tags are looked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Family {
+    /// `tag36h11`, the usual one.
+    Tag36h11,
+    /// `tag25h9`.
+    Tag25h9,
+    /// `tag16h5`: noise is easily taken for it.
+    Tag16h5,
+    /// `tagStandard41h12`.
+    Standard41h12,
+    /// `tagStandard52h13`.
+    Standard52h13,
+}
+
+/// A tag in an image.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Spotted {
+    /// Its number in the family.
+    pub id: u32,
+    /// Where its corners are seen, pixels: lower left, lower right, upper right, upper left of the tag as it is printed.
+    pub corners_px: [[f64; 2]; 4],
+}
+
+/// The tags of an image.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Sighting {
+    /// The camera.
+    pub camera: Arc<str>,
+    /// The device's stamp of the image.
+    pub stamp: Stamp,
+    /// What is in it, in no order; numbers may come twice where somebody printed a tag twice.
+    pub tags: Vec<Spotted>,
+}
+
+/// Looks for tags, one image at a time.
+#[derive(Debug)]
+pub struct Spotter {
+    images: SyncSender<Image>,
+    sightings: Receiver<Result<Sighting, Error>>,
+    n_at_work: usize,
+}
+
+impl Spotter {
+    /// Starts the thread, which ends with this.
+    ///
+    /// Fails where the system gives no thread.
+    pub fn start(family: Family) -> Result<Self, Error> {
+        // No image waits in the channel: a thread that is busy takes none.
+        let (images, to_look_at) = sync_channel(0);
+        // The thread goes on looking while the last sighting waits to be taken.
+        let (tell, sightings) = sync_channel(1);
+        let look_at_all = move || {
+            // It cannot go from thread to thread.
+            let mut detector = detector(family);
+            while let Ok(image) = to_look_at.recv() {
+                if tell.send(look(&mut detector, &image)).is_err() {
+                    return;
+                }
+            }
+        };
+        let thread = std::thread::Builder::new().name("tags".to_owned()).spawn(look_at_all);
+        thread.map_err(|source| Error::Thread { device: "tags".to_owned(), source })?;
+        Ok(Self { images, sightings, n_at_work: 0 })
+    }
+
+    /// Has a colour image looked at; false where the thread is busy with another one.
+    pub fn look(&mut self, image: Image) -> bool {
+        let is_taken = self.images.try_send(image).is_ok();
+        self.n_at_work += usize::from(is_taken);
+        is_taken
+    }
+
+    /// Looks at a colour image, whatever time that takes, and at those before it.
+    pub fn look_now(&mut self, image: Image) -> Vec<Result<Sighting, Error>> {
+        // The thread ends after this only.
+        let is_taken = self.images.send(image).is_ok();
+        self.n_at_work += usize::from(is_taken);
+        self.finish()
+    }
+
+    /// What was found since the last call; an image that cannot be read is an error.
+    pub fn found(&mut self) -> Vec<Result<Sighting, Error>> {
+        let found: Vec<_> = self.sightings.try_iter().collect();
+        self.n_at_work -= found.len();
+        found
+    }
+
+    /// The same, once everything was looked at.
+    pub fn finish(&mut self) -> Vec<Result<Sighting, Error>> {
+        let found: Vec<_> = self.sightings.iter().take(self.n_at_work).collect();
+        self.n_at_work = 0;
+        found
+    }
+}
+
+fn detector(family: Family) -> Detector {
+    let code = match family {
+        Family::Tag36h11 => Code::tag_36h11(),
+        Family::Tag25h9 => Code::tag_25h9(),
+        Family::Tag16h5 => Code::tag_16h5(),
+        Family::Standard41h12 => Code::tag_standard_41h12(),
+        Family::Standard52h13 => Code::tag_standard_52h13(),
+    };
+    let detector = Detector::builder().add_family_bits(code, MENDED_CELLS).build();
+    let mut detector = detector.expect("it has a family");
+    detector.set_thread_number(1);
+    detector
+}
+
+/// All tags in an image.
+fn look(detector: &mut Detector, image: &Image) -> Result<Sighting, Error> {
+    let rgb = image.decode_rgb()?;
+    let [width, height] = image.size_px.map(|side| side as usize);
+    let mut gray = Gray::zeros_with_alignment(width, height, 1).map_err(|_| image.wrong_kind("color"))?;
+    for (gray, [red, green, blue]) in gray.as_slice_mut().iter_mut().zip(rgb.as_chunks().0) {
+        // Rec. 601 in 256 parts.
+        let parts = 77 * u32::from(*red) + 150 * u32::from(*green) + 29 * u32::from(*blue);
+        *gray = parts.to_le_bytes()[1];
+    }
+    detector.set_decimation(if width * height < MANY_PX { 1.0 } else { 2.0 });
+    let found = detector.detect(&gray);
+    let is_clear = |tag: &&apriltag::Detection| tag.decision_margin() >= MIN_MARGIN;
+    let spotted =
+        |tag: &apriltag::Detection| Some(Spotted { id: tag.id().try_into().ok()?, corners_px: tag.corners() });
+    let tags = found.iter().filter(is_clear).filter_map(spotted);
+    Ok(Sighting { camera: Arc::clone(&image.camera), stamp: image.stamp, tags: tags.collect() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::PixelFormat;
+    use crate::test_data;
+
+    fn image(size_px: [u32; 2], format: PixelFormat, data: Vec<u8>) -> Image {
+        let (camera, stamp) = ("wrist".into(), Stamp(5));
+        Image { camera, stamp, size_px, format, data: data.into(), exposure_secs: None, n_skipped: 0 }
+    }
+
+    /// The corners of four numbers each in brackets, line by line.
+    fn truth(text: &str) -> Vec<[[f64; 2]; 4]> {
+        let corner = |text: &str| {
+            let (x, y) = text.split_once(')')?.0.split_once(' ')?;
+            Some([x.parse().ok()?, y.parse().ok()?])
+        };
+        let line = |line: &str| <[[f64; 2]; 4]>::try_from(line.split('(').filter_map(corner).collect::<Vec<_>>()).ok();
+        text.lines().filter_map(line).collect()
+    }
+
+    #[test]
+    fn tags_of_a_photo_are_where_they_were_marked() {
+        /// The marks are the detector's own of an earlier version, with other settings.
+        const NEAR_PX: f64 = 1.5;
+        let Some(folder) = test_data::folder("apriltag") else { return };
+        let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
+        let photo = image([799, 533], PixelFormat::Jpeg, read("33369213973_9d9bb4cc96_c.jpg"));
+        let marked = truth(&String::from_utf8(read("33369213973_9d9bb4cc96_c.txt")).unwrap());
+        assert_eq!(marked.len(), 12);
+        let mut spotter = Spotter::start(Family::Tag36h11).unwrap();
+        let sightings = spotter.look_now(photo);
+        let sighting = sightings[0].as_ref().unwrap();
+        assert_eq!((&*sighting.camera, sighting.stamp), ("wrist", Stamp(5)));
+        let is_near = |a: [f64; 2], b: &[f64; 2]| (a[0] - b[0]).hypot(a[1] - b[1]) < NEAR_PX;
+        let is_found = |marked: &&[[f64; 2]; 4]| {
+            let is_it =
+                |tag: &&Spotted| tag.corners_px.iter().all(|seen| marked.iter().any(|mark| is_near(*seen, mark)));
+            sighting.tags.iter().find(is_it).is_some_and(|tag| tag.id == 0)
+        };
+        let n_found = marked.iter().filter(is_found).count();
+        assert!(n_found >= 10, "{n_found} of 12: {:?}", sighting.tags);
+    }
+
+    #[test]
+    fn no_tag_is_seen_where_none_is_and_a_broken_image_is_an_error() {
+        let mut spotter = Spotter::start(Family::Tag36h11).unwrap();
+        let mut random = 3_u32;
+        let noise = (0..320 * 240).map(|_| {
+            random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            random.to_be_bytes()[0]
+        });
+        let sightings = spotter.look_now(image([320, 240], PixelFormat::Gray8, noise.collect()));
+        assert_eq!(sightings[0].as_ref().unwrap().tags, []);
+        assert!(spotter.look_now(image([320, 240], PixelFormat::Jpeg, vec![1, 2, 3]))[0].is_err());
+        assert!(spotter.look_now(image([1, 1], PixelFormat::Gray8, vec![9]))[0].as_ref().unwrap().tags.is_empty());
+        assert!(spotter.found().is_empty() && spotter.finish().is_empty());
+    }
+}

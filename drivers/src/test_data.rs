@@ -1,0 +1,14 @@
+//! Where real data lie that some tests compare with; elsewhere those tests are skipped with a line.
+
+use std::path::{Path, PathBuf};
+
+/// A folder of the test data: below `FIELDRIG_TEST_DATA`, or beside the project; none where there is none, which is told.
+pub(crate) fn folder(name: &str) -> Option<PathBuf> {
+    let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
+    let folder = std::env::var_os("FIELDRIG_TEST_DATA").map_or_else(beside, PathBuf::from).join(name);
+    if !folder.is_dir() {
+        eprintln!("skipped: no test data at {}", folder.display());
+        return None;
+    }
+    Some(folder)
+}
