@@ -363,6 +363,7 @@ fn can(rig: Option<&Rig>) -> Vec<Finding> {
             interface,
             bitrate_hz: link.bitrate_hz.unwrap_or(1_000_000),
             data_bitrate_hz: link.data_bitrate_hz,
+            accept_no_restart: false,
         };
         let complaints = link.complaints(bus.unwrap_or(&own));
         if complaints.is_empty() {

@@ -90,8 +90,14 @@ impl Recorded {
     }
 
     fn summary(&self) -> String {
-        let Self { images, depth_images, joint_states, .. } = self;
-        format!("{images} color images, {depth_images} depth images, {joint_states} joint states")
+        let Self { images, depth_images, joint_states, base_poses, range_scans, .. } = self;
+        let mut told = format!("{images} color images, {depth_images} depth images, {joint_states} joint states");
+        for (n, what) in [(base_poses, "base poses"), (range_scans, "range scans")] {
+            if *n > 0 {
+                told.push_str(&format!(", {n} {what}"));
+            }
+        }
+        told
     }
 
     /// What did not come, a sentence a camera.

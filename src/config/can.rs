@@ -64,6 +64,7 @@ fn bus(interface: String, mut keys: Section<'_>) -> BusConfig {
         interface,
         bitrate_hz: rate(keys.whole("bitrate_hz", 10_000..=1_000_000)).unwrap_or(1_000_000),
         data_bitrate_hz: rate(keys.whole("data_bitrate_hz", 10_000..=8_000_000)),
+        accept_no_restart: keys.flag("accept_no_restart").unwrap_or(false),
     };
     keys.end();
     bus
@@ -166,6 +167,7 @@ pub(super) fn write(buses: &[BusConfig], motors: &[MotorConfig]) -> [Option<Valu
         table([
             ("bitrate_hz", whole(bus.bitrate_hz.into())),
             ("data_bitrate_hz", bus.data_bitrate_hz.and_then(|rate| whole(rate.into()))),
+            ("accept_no_restart", is(bus.accept_no_restart)),
         ])
     };
     let named = |tables: Table| (!tables.is_empty()).then_some(Value::Table(tables));

@@ -73,10 +73,11 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a good value that differs from the one in force, and a value that is not allowed.
-const KEYS: [(&str, &str, &str); 162] = [
+const KEYS: [(&str, &str, &str); 163] = [
     ("arm.rate_hz", "500", "0"),
     ("arm.bus.can0.bitrate_hz", "500_000", "1"),
     ("arm.bus.can0.data_bitrate_hz", "5_000_000", "9_000_000"),
+    ("arm.bus.can0.accept_no_restart", "true", "1"),
     ("arm.motor.first", "{ family = 'odrive', bus = 'can0', id = 1 }", "{ family = 'odrive', bus = 'can0', id = 63 }"),
     ("arm.motor.first", "{ family = 'tmotor', bus = 'can0', id = 1, model = 'ak80-64' }", "{ bus = 'can0', id = 1 }"),
     ("arm.motor.first.family", "'damiao'", "'dynamixel'"),

@@ -39,7 +39,12 @@ impl Wire {
     }
 
     pub(crate) fn config(&self, is_fd: bool) -> BusConfig {
-        BusConfig { interface: self.0.to_owned(), bitrate_hz: 1_000_000, data_bitrate_hz: is_fd.then_some(5_000_000) }
+        BusConfig {
+            interface: self.0.to_owned(),
+            bitrate_hz: 1_000_000,
+            data_bitrate_hz: is_fd.then_some(5_000_000),
+            accept_no_restart: false,
+        }
     }
 }
 
@@ -259,7 +264,12 @@ fn what_is_missing_is_told() {
         let config = ArmConfig { buses: vec![bus], motors, rate_hz: 200.0 };
         CanArm::open(&config).map(drop).expect_err("it cannot be opened").to_string()
     };
-    let missing = BusConfig { interface: "can7".to_owned(), bitrate_hz: 1_000_000, data_bitrate_hz: None };
+    let missing = BusConfig {
+        interface: "can7".to_owned(),
+        bitrate_hz: 1_000_000,
+        data_bitrate_hz: None,
+        accept_no_restart: false,
+    };
     let told = open(missing, vec![damiao(1)]);
     assert!(told.contains("can7") && told.contains("no such interface"), "{told}");
 

@@ -482,7 +482,7 @@ fn a_child_that_moves_an_arm() {
     let (configs, on_loss) =
         if is_held { (vec![drive(5), drive(6)], OnLoss::Hold) } else { (watched(), OnLoss::Release) };
     let bus = words.split(' ').next().expect("a name").to_owned();
-    let wire = BusConfig { interface: bus, bitrate_hz: 1_000_000, data_bitrate_hz: None };
+    let wire = BusConfig { interface: bus, bitrate_hz: 1_000_000, data_bitrate_hz: None, accept_no_restart: false };
     let mut arm = MovableCanArm::open(&movable(wire, &configs, on_loss)).expect("they are switched on");
     let mut lines = std::io::stdin().lines();
     let mut side = 1.0;

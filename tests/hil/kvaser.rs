@@ -73,7 +73,12 @@ impl Card {
     }
 
     fn config(&self) -> BusConfig {
-        BusConfig { interface: self.interface.to_owned(), bitrate_hz: 1_000_000, data_bitrate_hz: None }
+        BusConfig {
+            interface: self.interface.to_owned(),
+            bitrate_hz: 1_000_000,
+            data_bitrate_hz: None,
+            accept_no_restart: false,
+        }
     }
 
     fn bus(&self) -> Bus {

@@ -227,7 +227,12 @@ mod tests {
 
     #[test]
     fn the_rate_keeps_the_load_of_a_classic_bus_under_seventy_percent() {
-        let bus = BusConfig { interface: "can0".to_owned(), bitrate_hz: 1_000_000, data_bitrate_hz: None };
+        let bus = BusConfig {
+            interface: "can0".to_owned(),
+            bitrate_hz: 1_000_000,
+            data_bitrate_hz: None,
+            accept_no_restart: false,
+        };
         let motors: Vec<_> = (0..7)
             .map(|ix| {
                 let family = Family::Damiao { motor: ix + 1, feedback: 0x10 + ix };

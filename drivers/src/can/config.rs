@@ -23,6 +23,8 @@ pub struct BusConfig {
     pub bitrate_hz: u32,
     /// Bits a second of the data of FD frames; `None` on a classic bus.
     pub data_bitrate_hz: Option<u32>,
+    /// The kernel cannot restart the adapter (those on a serial line, `slcan`): once it is off the bus it stays off.
+    pub accept_no_restart: bool,
 }
 
 impl BusConfig {

@@ -122,8 +122,12 @@ impl Link {
             let is = self.data_bitrate_hz.map_or_else(|| "not set".to_owned(), |rate| rate.to_string());
             complain(format!("its bit rate of FD data is {is}, the rig file says {data_bitrate_hz}"));
         }
-        if self.restart_millis == Some(0) {
-            complain("it does not come back by itself once it went off the bus (restart-ms 0)".to_owned());
+        if self.restart_millis == Some(0) && !wanted.accept_no_restart {
+            complain(format!(
+                "it does not come back by itself once it went off the bus (restart-ms 0; for an adapter that cannot, on a serial \
+                 line for instance, arm.bus.{}.accept_no_restart = true)",
+                self.interface
+            ));
         }
         if self.is_up && self.state >= Some(State::BusOff) {
             complain("it is off the bus: look at wiring, termination and the bit rate of the others".to_owned());
@@ -171,8 +175,9 @@ fn set_up(interface: &str, is_virtual: bool, wanted: &BusConfig) -> String {
         };
     }
     let fd = wanted.data_bitrate_hz.map_or_else(String::new, |rate| format!(" dbitrate {rate} fd on"));
+    let restart = if wanted.accept_no_restart { String::new() } else { format!(" restart-ms {RESTART_MILLIS}") };
     format!(
-        "sudo ip link set {interface} down; sudo ip link set {interface} up type can bitrate {}{fd} restart-ms {RESTART_MILLIS}",
+        "sudo ip link set {interface} down; sudo ip link set {interface} up type can bitrate {}{fd}{restart}",
         wanted.bitrate_hz
     )
 }
@@ -204,7 +209,7 @@ mod tests {
     use super::*;
 
     fn wanted(data_bitrate_hz: Option<u32>) -> BusConfig {
-        BusConfig { interface: "can0".to_owned(), bitrate_hz: 1_000_000, data_bitrate_hz }
+        BusConfig { interface: "can0".to_owned(), bitrate_hz: 1_000_000, data_bitrate_hz, accept_no_restart: false }
     }
 
     fn good() -> Link {
@@ -252,6 +257,8 @@ mod tests {
 
     #[test]
     fn virtual_interfaces_have_no_rate_and_need_only_be_up() {
+        let slcan = BusConfig { accept_no_restart: true, ..wanted(None) };
+        assert_eq!(Link { restart_millis: Some(0), ..good() }.complaints(&slcan), []);
         let link = Link { bitrate_hz: None, restart_millis: None, state: None, n_errors: None, ..good() };
         assert_eq!(link.complaints(&wanted(None)), []);
         let down = Link { is_up: false, ..link };

@@ -649,7 +649,12 @@ mod tests {
         });
         MovableArmConfig {
             arm: ArmConfig {
-                buses: vec![BusConfig { interface: "can0".to_owned(), bitrate_hz: 1_000_000, data_bitrate_hz: None }],
+                buses: vec![BusConfig {
+                    interface: "can0".to_owned(),
+                    bitrate_hz: 1_000_000,
+                    data_bitrate_hz: None,
+                    accept_no_restart: false,
+                }],
                 motors: motors.collect(),
                 rate_hz: 1000.0,
             },
