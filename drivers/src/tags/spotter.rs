@@ -15,6 +15,9 @@ const MIN_MARGIN: f32 = 20.0;
 /// From this many pixels on, squares are looked for at half the resolution; corners are refined at the whole.
 const MANY_PX: usize = 1_000_000;
 
+/// The detector reads beyond images smaller than a few of its tiles of 4 pixels; none has room for a tag.
+const MIN_SIDE_PX: usize = 16;
+
 /// Which tags are looked for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Family {
@@ -129,6 +132,10 @@ fn detector(family: Family) -> Detector {
 fn look(detector: &mut Detector, image: &Image) -> Result<Sighting, Error> {
     let rgb = image.decode_rgb()?;
     let [width, height] = image.size_px.map(|side| side as usize);
+    let sighting = |tags| Sighting { camera: Arc::clone(&image.camera), stamp: image.stamp, tags };
+    if width.min(height) < MIN_SIDE_PX {
+        return Ok(sighting(Vec::new()));
+    }
     let mut gray = Gray::zeros_with_alignment(width, height, 1).map_err(|_| image.wrong_kind("color"))?;
     for (gray, [red, green, blue]) in gray.as_slice_mut().iter_mut().zip(rgb.as_chunks().0) {
         // Rec. 601 in 256 parts.
@@ -141,7 +148,7 @@ fn look(detector: &mut Detector, image: &Image) -> Result<Sighting, Error> {
     let spotted =
         |tag: &apriltag::Detection| Some(Spotted { id: tag.id().try_into().ok()?, corners_px: tag.corners() });
     let tags = found.iter().filter(is_clear).filter_map(spotted);
-    Ok(Sighting { camera: Arc::clone(&image.camera), stamp: image.stamp, tags: tags.collect() })
+    Ok(sighting(tags.collect()))
 }
 
 #[cfg(test)]
@@ -192,14 +199,20 @@ mod tests {
     fn no_tag_is_seen_where_none_is_and_a_broken_image_is_an_error() {
         let mut spotter = Spotter::start(Family::Tag36h11).unwrap();
         let mut random = 3_u32;
-        let noise = (0..320 * 240).map(|_| {
-            random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            random.to_be_bytes()[0]
-        });
-        let sightings = spotter.look_now(image([320, 240], PixelFormat::Gray8, noise.collect()));
-        assert_eq!(sightings[0].as_ref().unwrap().tags, []);
+        let mut noise = |n: usize| -> Vec<u8> {
+            let next = |_| {
+                random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                random.to_be_bytes()[0]
+            };
+            (0..n).map(next).collect()
+        };
+        let odd = (1..40_u32).flat_map(|side| [[side, 41 - side], [side, 2000], [999, side]]);
+        for size_px in odd.chain([[320, 240], [1201, 901]]) {
+            let pixels = noise((size_px[0] * size_px[1]) as usize);
+            let sightings = spotter.look_now(image(size_px, PixelFormat::Gray8, pixels));
+            assert_eq!(sightings[0].as_ref().unwrap().tags, [], "{size_px:?}");
+        }
         assert!(spotter.look_now(image([320, 240], PixelFormat::Jpeg, vec![1, 2, 3]))[0].is_err());
-        assert!(spotter.look_now(image([1, 1], PixelFormat::Gray8, vec![9]))[0].as_ref().unwrap().tags.is_empty());
         assert!(spotter.found().is_empty() && spotter.finish().is_empty());
     }
 }
