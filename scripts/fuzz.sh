@@ -19,8 +19,10 @@ for target in "${@:-${all[@]}}"; do
     for folder in "fuzz/seeds/$target" $(case $target in rig) echo rigs ;; urdf) echo rigs/robots kinematics/tests/data ;; esac); do
         [ ! -d "$folder" ] || seeds+=("$folder")
     done
-    mkdir -p "fuzz/corpus/$target"
     echo "== $target"
+    # A target that does not build, or that does not exist, is no finding: that ends here.
+    cargo +nightly fuzz build "$target"
+    mkdir -p "fuzz/corpus/$target"
     cargo +nightly fuzz run "$target" "fuzz/corpus/$target" "${seeds[@]}" -- \
         -max_total_time="$seconds" -timeout=5 -rss_limit_mb=2048 -max_len=8192 -print_final_stats=1 || found+=("$target")
 done
