@@ -37,6 +37,7 @@ check: deps nokhwa-packages realsense open-ends ## Format, clippy, documentation
 	cargo clippy --workspace --exclude sim --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps $(TEST_FEATURES)
 	cargo test --workspace $(TEST_FEATURES) --lib every_kernel_parses_and_validates
+	@cargo metadata --locked --manifest-path fuzz/Cargo.toml --format-version 1 >/dev/null || { echo "fuzz/Cargo.lock is not of fuzz/Cargo.toml: cargo metadata --manifest-path fuzz/Cargo.toml brings it up to date" >&2; exit 1; }
 	@if cargo deny --version >/dev/null 2>&1; then \
 		cargo deny check licenses bans sources || exit 1; \
 		if cargo deny fetch db >/dev/null 2>&1; then cargo deny check advisories; \

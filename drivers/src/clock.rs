@@ -22,12 +22,18 @@ fn read(clock: rustix::time::ClockId) -> Stamp {
     Stamp(now.tv_sec.saturating_mul(NANOS_PER_SEC).saturating_add(now.tv_nsec))
 }
 
-/// How long processors have worked for this process so far.
+/// How long processors have worked for this process so far; `None` where the system is not asked.
 #[cfg(unix)]
-pub fn processor() -> Duration {
+pub fn processor() -> Option<Duration> {
     let spent = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
     let [secs, nanos] = [spent.tv_sec, spent.tv_nsec].map(|part| u64::try_from(part).unwrap_or(0));
-    Duration::from_secs(secs) + Duration::from_nanos(nanos)
+    Some(Duration::from_secs(secs) + Duration::from_nanos(nanos))
+}
+
+/// How long processors have worked for this process so far; `None` where the system is not asked.
+#[cfg(not(unix))]
+pub fn processor() -> Option<Duration> {
+    None
 }
 
 /// Now, since this was first asked for: a clock of this program alone, where there is no other.

@@ -1,5 +1,6 @@
 //! A camera that was lost: since when, how often it was looked for, when the next try is due. The same for all drivers of cameras.
 
+#[cfg(any(target_os = "linux", feature = "realsense"))]
 use kinematics::Stamp;
 use std::time::{Duration, Instant};
 
@@ -35,6 +36,7 @@ impl Outage {
 }
 
 /// Images that a rate puts between two stamps.
+#[cfg(any(target_os = "linux", feature = "realsense"))]
 pub(crate) fn n_between(last: Stamp, next: Stamp, rate_hz: f64) -> u64 {
     let periods = next.0.saturating_sub(last.0) as f64 * 1e-9 * rate_hz;
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the cast saturates, which is meant")]
@@ -46,6 +48,7 @@ pub(crate) fn n_between(last: Stamp, next: Stamp, rate_hz: f64) -> u64 {
 mod tests {
     use super::*;
 
+    #[cfg(any(target_os = "linux", feature = "realsense"))]
     #[test]
     fn an_outage_is_counted_in_images() {
         let millis = |millis: i64| Stamp(millis * 1_000_000);

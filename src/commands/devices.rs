@@ -2,6 +2,7 @@
 
 use crate::exit::Exit;
 use crate::print;
+#[cfg(target_os = "linux")]
 use drivers::v4l2;
 use serde::Serialize;
 use std::path::Path;
@@ -37,6 +38,7 @@ struct Found {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut found = vec![gpu(), simulation()];
     let sys = Path::new("/sys");
+    #[cfg(target_os = "linux")]
     found.extend(video_devices(v4l2::cameras()));
     found.extend(realsense_cameras(sys));
     found.extend(can_interfaces(sys));
@@ -77,6 +79,7 @@ fn simulation() -> Found {
 }
 
 /// V4L2 devices that give images, with all that they offer.
+#[cfg(target_os = "linux")]
 fn video_devices(cameras: Vec<Result<v4l2::Found, v4l2::Problem>>) -> Vec<Found> {
     let describe = |camera: v4l2::Found| {
         let usb = camera.usb_mbits.map_or(String::new(), |mbits| format!(", USB at {mbits} Mbit/s"));

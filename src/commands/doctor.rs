@@ -7,6 +7,7 @@ use crate::config::{Camera, CameraDriver, Rig};
 use crate::exit::Exit;
 use crate::print;
 use crate::stop::Stop;
+#[cfg(target_os = "linux")]
 use drivers::v4l2;
 use serde::Serialize;
 use std::net::TcpListener;
@@ -84,6 +85,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     findings.push(memory(Path::new("/proc")));
     findings.push(realtime(Path::new("/proc")));
     findings.push(cameras(Path::new("/dev")));
+    #[cfg(target_os = "linux")]
     findings.extend(v4l2::cameras().into_iter().flatten().filter_map(|camera| usb(&camera)));
     findings.extend(realsense(rig.as_ref()));
     findings.extend(can(rig.as_ref()));
@@ -277,6 +279,7 @@ fn cameras(dev: &Path) -> Finding {
 }
 
 /// What a camera on USB offers and its port cannot carry.
+#[cfg(target_os = "linux")]
 fn usb(camera: &v4l2::Found) -> Option<Finding> {
     let carries = format!("{:.1} MB/s", camera.usb_bytes_per_sec()? * 1e-6);
     let name = format!("{} ({})", camera.name, camera.node.display());

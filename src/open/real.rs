@@ -8,10 +8,13 @@ use anyhow::{Context, bail};
 use drivers::can::{self, CanArm, MovableArmConfig, MovableCanArm};
 #[cfg(target_os = "linux")]
 use drivers::franka::{self, FrankaArm, MovableFrankaArm};
-use drivers::motion::{MotionConfig, MotionLimits, MovableArm};
+use drivers::motion::MovableArm;
+#[cfg(target_os = "linux")]
+use drivers::motion::{MotionConfig, MotionLimits};
 use drivers::udp::{UdpArm, UdpBase, UdpScanner};
 #[cfg(target_os = "linux")]
 use drivers::v4l2::{Config, Settings, V4l2Camera, V4l2Format};
+#[cfg(target_os = "linux")]
 use drivers::wire::can::odrive::Endpoints;
 use drivers::{Arm, Base, Devices, RangeScanner};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -66,6 +69,7 @@ pub(crate) fn movable_arm(rig: &Rig) -> anyhow::Result<Box<dyn MovableArm>> {
 }
 
 /// How each joint may be moved: the description's limits, the rig's speed.
+#[cfg(target_os = "linux")]
 fn motion_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MotionConfig> {
     let Rig { arm, .. } = rig;
     let chain =

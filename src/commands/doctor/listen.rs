@@ -113,8 +113,9 @@ pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Heard>
             }
         }
     }
-    let (spent, cpu) = (began.elapsed(), clock::processor() - cpu_began);
-    findings.push(Finding::ok("processor", cpu_told(cpu, spent)));
+    if let (Some(cpu_began), Some(cpu)) = (cpu_began, clock::processor()) {
+        findings.push(Finding::ok("processor", cpu_told(cpu - cpu_began, began.elapsed())));
+    }
     let wanted = wanted(&rig);
     findings.extend(missing(&wanted, &tracks));
     let devices: Vec<_> = tracks
