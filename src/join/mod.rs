@@ -18,7 +18,7 @@ mod tests;
 mod waiting;
 
 pub(crate) use list::{KeyframeList, split_name, split_named, text_of as keyframe_list};
-pub(crate) use motion::Motion;
+pub(crate) use motion::{Motion, Posed};
 pub(crate) use refusal::{Counts, Refusal, Use};
 
 use crate::config::{self, BaseDriver, CameraDriver, Parent, Rig};
@@ -28,7 +28,6 @@ use anyhow::Context;
 use assemble::Lens;
 use drivers::{Image, Sample, TruthImage};
 use kinematics::{HistoryError, Stamp, Transform};
-use motion::Posed;
 use ranges::Ranges;
 use spacing::Spacing;
 use std::sync::Arc;

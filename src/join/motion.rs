@@ -44,7 +44,7 @@ struct Told {
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Posed {
     pub(crate) world_from_camera: Transform,
-    pub(super) twist: Option<Twist>,
+    pub(crate) twist: Option<Twist>,
     /// Of the camera for each joint of the chain that moves by a radian or metre; none where no joint carries the camera.
     pub(super) joint_twists: Arc<[Twist]>,
     /// Where the base was, where one that moves carries the camera.

@@ -346,21 +346,22 @@ fn tags_tell_where_a_base_stands_that_nobody_measured() {
         off[off.len() - 1]
     );
     let last = &told[told.len() - 1];
-    assert!(last.translation.vector.norm() < 3e-3 && last.rotation.angle() < 5e-3, "{last}");
-    assert!(off[off.len() / 2][0] < 5e-3, "{off:?}");
+    assert!(last.translation.vector.norm() < 1e-3 && last.rotation.angle() < 1e-3, "{last}");
+    assert!(off[off.len() / 2][0] < 1e-3, "{off:?}");
     assert!(keyframes.len() >= 8, "{}", join.counts());
     let worst = keyframes.iter().filter_map(|keyframe| {
         let truth = keyframe.truth.as_ref()?;
         Some((keyframe.world_from_camera.inverse() * truth.world_from_camera).translation.vector.norm())
     });
     let worst = worst.fold(0.0, f64::max);
-    assert!(worst > 0.0 && worst < 2e-2, "{worst} m");
+    assert!(worst > 0.0 && worst < 5e-3, "{worst} m");
 }
 
 #[test]
 fn corners_of_tags_are_seen_where_the_simulator_puts_them() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
-    let overrides = [Override::new("sim.lockstep", true), Override::new("sim.n_images", 12)];
+    let at_once = Override::new("camera.wrist.readout_micros", 0);
+    let overrides = [Override::new("sim.lockstep", true), Override::new("sim.n_images", 30), at_once];
     let rig = Rig::load(&path, &overrides).expect("a rig file that comes along");
     let mut spotter = Spotter::start(Family::Tag36h11).expect("a thread");
     let mut source = super::rig(rig.clone(), Devices::Sim).expect("the simulator").source;
@@ -388,9 +389,15 @@ fn corners_of_tags_are_seen_where_the_simulator_puts_them() {
             _ => {}
         }
     }
-    let n = off_px.len() as f64;
-    let mean = [0, 1].map(|axis| off_px.iter().map(|off| off[axis]).sum::<f64>() / n);
-    let spread = (off_px.iter().map(|[x, y]| x * x + y * y).sum::<f64>() / n).sqrt();
+    // Medians: a side that is seen from far aside has corners that are anywhere.
+    let median = |mut numbers: Vec<f64>| {
+        numbers.sort_by(f64::total_cmp);
+        numbers[numbers.len() / 2]
+    };
+    let along = |axis: usize| median(off_px.iter().map(|off| off[axis]).collect());
+    let spread = median(off_px.iter().map(|[x, y]| x.hypot(*y)).collect());
     // Half a pixel would be a corner counted from the middle of the first one.
-    assert!(n >= 40.0 && mean.iter().all(|off| off.abs() < 0.2) && spread < 0.8, "{n}: {mean:?}, {spread} px");
+    let n = off_px.len();
+    assert!(n >= 100 && along(0).abs() < 0.15 && along(1).abs() < 0.15, "{n}: {}, {} px", along(0), along(1));
+    assert!(spread < 0.5, "{spread} px");
 }

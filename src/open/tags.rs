@@ -1,8 +1,8 @@
 //! A base whose place is told by tags that its cameras see: its poses are made of the images and join the samples.
 
 use crate::config::{BaseDriver, Camera, Parent, Rig};
-use crate::join::Motion;
-use drivers::tags::{PlacedTag, Sighting, Spotter, Steady, Unlocated, locate};
+use crate::join::{Motion, Posed};
+use drivers::tags::{PlacedTag, Seeing, Sighting, Spotter, Steady, Unlocated, locate};
 use drivers::{BasePose, Error, Image, Sample, Source};
 use kinematics::{HistoryError, Stamp, Transform, Twist};
 use nalgebra::{Matrix6, Vector3, Vector6};
@@ -103,24 +103,26 @@ impl WithTags {
         while let Some(sighting) = self.waiting.front() {
             let Some(camera) = self.camera(&sighting.camera) else { return };
             let stamp = mid_exposure(camera, sighting.stamp);
-            let base_from_camera = match self.arm.at(camera, stamp) {
-                Ok(posed) => Some(posed.world_from_camera),
+            match self.arm.at(camera, stamp) {
+                Ok(posed) => self.locate(stamp, &posed),
                 Err(HistoryError::NotYet { .. }) => return,
-                Err(_) => None,
-            };
-            match base_from_camera {
-                Some(base_from_camera) => self.locate(stamp, &base_from_camera),
-                None => self.counts.n_without_joints += 1,
+                Err(_) => self.counts.n_without_joints += 1,
             }
             self.waiting.pop_front();
         }
     }
 
-    fn locate(&mut self, stamp: Stamp, base_from_camera: &Transform) {
+    fn locate(&mut self, stamp: Stamp, posed: &Posed) {
+        let base_from_camera = &posed.world_from_camera;
         let Some(sighting) = self.waiting.front() else { return };
         let Some(camera) = self.camera(&sighting.camera) else { return };
         let known = sighting.tags.iter().filter_map(|tag| Some((self.tags.get(&tag.id)?, tag.corners_px)));
-        let located = locate(&camera.intrinsics, &known.collect::<Vec<_>>());
+        let seeing = Seeing {
+            intrinsics: &camera.intrinsics,
+            twist: posed.twist.unwrap_or_else(Twist::zero),
+            readout_secs: camera.readout_micros.unwrap_or(0.0) * 1e-6,
+        };
+        let located = locate(&seeing, &known.collect::<Vec<_>>());
         match located {
             Ok(located) if self.newest.is_none_or(|newest| stamp > newest) => {
                 let world_from_base = located.world_from_camera * base_from_camera.inverse();

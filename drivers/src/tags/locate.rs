@@ -10,6 +10,8 @@ use nalgebra::{Matrix2x3, Matrix3, Matrix3x6, Matrix6, Rotation3, SMatrix, SVect
 
 /// Corners are found this well in a sharp image, pixels; nobody sees better.
 const CORNER_SIGMA_PX: f64 = 0.2;
+/// What is off by more counts by its size, not by its square (Huber 1964): sides seen from far aside have corners that are anywhere.
+const HUBER_PX: f64 = 3.0 * CORNER_SIGMA_PX;
 /// Corners further off than this, root mean square, are not those of the tags that the rig file tells of; in pixels.
 const MAX_OFF_PX: f64 = 3.0;
 /// The second best pose explains a tag so much worse, by squares, or the best one is not trusted.
@@ -25,10 +27,29 @@ pub struct PlacedTag {
     pub world_from_tag: Transform,
 }
 
+/// A camera that looks.
+#[derive(Clone, Debug)]
+pub struct Seeing<'a> {
+    /// Its lens.
+    pub intrinsics: &'a Intrinsics,
+    /// How it moves by what carries it, in its own axes. Rows are exposed one after the other: corners are seen from where it was then.
+    pub twist: Twist,
+    /// From the first row to the last, seconds; 0 where all are exposed at once.
+    pub readout_secs: f64,
+}
+
+impl Seeing<'_> {
+    /// The camera at the middle of its exposure, seen by itself at the instant of a row.
+    fn row_from_middle(&self, row_px: f64) -> Transform {
+        let since_middle_frac = row_px / f64::from(self.intrinsics.size_px[1].max(1)) - 0.5;
+        transform::exp(&self.twist, since_middle_frac.clamp(-0.5, 0.5) * self.readout_secs).inverse()
+    }
+}
+
 /// Where a camera is.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Located {
-    /// Pose of the camera.
+    /// Pose of the camera at the middle of its exposure.
     pub world_from_camera: Transform,
     /// Covariance of the pose: of a small motion of the world seen by the camera, in its axes; metres first, then radians.
     pub covariance: Matrix6<f64>,
@@ -59,16 +80,19 @@ pub enum Unlocated {
 struct Corner {
     world_m: Vector3<f64>,
     seen_px: [f64; 2],
+    /// From the camera in the middle of the exposure to that at the instant of the corner's row.
+    row_from_middle: Transform,
 }
 
 /// Where a camera is by the tags that it sees, each with its corners as [`super::Spotted`] tells them.
-pub fn locate(intrinsics: &Intrinsics, tags: &[(&PlacedTag, [[f64; 2]; 4])]) -> Result<Located, Unlocated> {
-    let corners: Vec<Corner> = tags.iter().flat_map(|(tag, seen_px)| corners(tag, seen_px)).collect();
+pub fn locate(camera: &Seeing<'_>, tags: &[(&PlacedTag, [[f64; 2]; 4])]) -> Result<Located, Unlocated> {
+    let intrinsics = camera.intrinsics;
+    let corners: Vec<Corner> = tags.iter().flat_map(|(tag, seen_px)| corners(camera, tag, seen_px)).collect();
     let starts = tags.iter().flat_map(|(tag, seen_px)| starts(intrinsics, tag, seen_px));
     let mut found: Vec<(f64, Transform)> = starts.filter_map(|start| refine(intrinsics, &corners, start)).collect();
     found.sort_by(|(a, _), (b, _)| a.total_cmp(b));
     let Some(&(squares, camera_from_world)) = found.first() else { return Err(Unlocated::NoTag) };
-    let off_px = (squares / corners.len() as f64).sqrt();
+    let off_px = off_px(intrinsics, &corners, &camera_from_world);
     if off_px > MAX_OFF_PX {
         return Err(Unlocated::FarOff { off_px });
     }
@@ -89,11 +113,12 @@ fn on_tag(size_m: f64) -> [Vector3<f64>; 4] {
     [[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]].map(|[x, y]| Vector3::new(x, y, 0.0) * (0.5 * size_m))
 }
 
-fn corners(tag: &PlacedTag, seen_px: &[[f64; 2]; 4]) -> [Corner; 4] {
+fn corners(camera: &Seeing<'_>, tag: &PlacedTag, seen_px: &[[f64; 2]; 4]) -> [Corner; 4] {
     let on_tag = on_tag(tag.size_m);
     std::array::from_fn(|ix| Corner {
         world_m: (tag.world_from_tag * nalgebra::Point3::from(on_tag[ix])).coords,
         seen_px: seen_px[ix],
+        row_from_middle: camera.row_from_middle(seen_px[ix][1]),
     })
 }
 
@@ -160,7 +185,7 @@ fn refine(intrinsics: &Intrinsics, corners: &[Corner], mut pose: Transform) -> O
     Some((squares, pose))
 }
 
-/// Sum of the squares of what is off, px², and the normal equations for a small motion of the world in the camera's axes; `None`
+/// Sum of the squares of what is off, px², large ones tempered, and the normal equations for a small motion of the world in the camera's axes; `None`
 /// where a corner is not before the camera.
 fn equations(
     intrinsics: &Intrinsics,
@@ -168,18 +193,31 @@ fn equations(
     camera_from_world: &Transform,
 ) -> Option<(f64, Matrix6<f64>, Vector6<f64>)> {
     let (mut squares, mut normal, mut right) = (0.0, Matrix6::zeros(), Vector6::zeros());
-    for Corner { world_m, seen_px } in corners {
+    for Corner { world_m, seen_px, row_from_middle } in corners {
         let point = camera_from_world.rotation * world_m + camera_from_world.translation.vector;
-        let (pixel, by_point): (_, Matrix2x3<f64>) = intrinsics.project_with_jacobian(&point)?;
+        let at_row = row_from_middle.rotation * point + row_from_middle.translation.vector;
+        let (pixel, by_point): (_, Matrix2x3<f64>) = intrinsics.project_with_jacobian(&at_row)?;
         let off = nalgebra::Vector2::new(seen_px[0] - pixel[0], seen_px[1] - pixel[1]);
         let mut by_motion = Matrix3x6::identity();
         by_motion.fixed_view_mut::<3, 3>(0, 3).copy_from(&-point.cross_matrix());
-        let jacobian = by_point * by_motion;
-        squares += off.norm_squared();
-        normal += jacobian.transpose() * jacobian;
-        right += jacobian.transpose() * off;
+        let jacobian = by_point * row_from_middle.rotation.to_rotation_matrix().matrix() * by_motion;
+        let off_px = off.norm();
+        let weight = HUBER_PX / off_px.max(HUBER_PX);
+        squares += weight * (2.0 - weight) * off_px * off_px;
+        normal += jacobian.transpose() * jacobian * weight;
+        right += jacobian.transpose() * off * weight;
     }
     Some((squares, normal, right))
+}
+
+/// How far corners are off, root mean square, pixels.
+fn off_px(intrinsics: &Intrinsics, corners: &[Corner], camera_from_world: &Transform) -> f64 {
+    let squares = corners.iter().map(|Corner { world_m, seen_px, row_from_middle }| {
+        let point = row_from_middle * camera_from_world * nalgebra::Point3::from(*world_m);
+        let [u, v] = intrinsics.project(&point.coords).unwrap_or([f64::INFINITY; 2]);
+        (seen_px[0] - u).powi(2) + (seen_px[1] - v).powi(2)
+    });
+    (squares.sum::<f64>() / corners.len() as f64).sqrt()
 }
 
 #[cfg(test)]
@@ -195,6 +233,30 @@ mod tests {
             lens,
             rectified: false,
         }
+    }
+
+    /// All rows are exposed at the same time.
+    fn at_once(intrinsics: &Intrinsics) -> Seeing<'_> {
+        Seeing { intrinsics, twist: Twist::zero(), readout_secs: 0.0 }
+    }
+
+    #[test]
+    fn a_camera_that_moves_while_its_rows_are_exposed_is_found_where_it_was_in_the_middle() {
+        let (intrinsics, middle, tag) = (camera(Lens::Pinhole), before(0.5), tag(0.0, [0.2, -0.6, 2.5]));
+        let twist = Twist { linear_m_s: Vector3::new(0.2, -0.1, 0.1), angular_rad_s: Vector3::new(0.3, 0.5, -0.4) };
+        let camera = Seeing { intrinsics: &intrinsics, twist, readout_secs: 0.03 };
+        // Each corner from where the camera is at the instant of the row that it is seen in.
+        let mut pixels = seen(&intrinsics, &middle, &tag, [[0.0; 2]; 4]);
+        for _ in 0..20 {
+            pixels = std::array::from_fn(|ix| {
+                let then = middle * camera.row_from_middle(pixels[ix][1]).inverse();
+                seen(&intrinsics, &then, &tag, [[0.0; 2]; 4])[ix]
+            });
+        }
+        let off = |camera: &Seeing<'_>| error(&locate(camera, &[(&tag, pixels)]).expect("a large tag"), &middle);
+        let [m, rad] = off(&camera);
+        assert!(m < 1e-8 && rad < 1e-8, "{m} m, {rad} rad");
+        assert!(off(&at_once(&intrinsics))[0] > 1e-3, "it does not matter here");
     }
 
     fn tag(x: f64, turn: [f64; 3]) -> PlacedTag {
@@ -234,7 +296,7 @@ mod tests {
             for turn in [[0.0; 3], [0.5, 0.0, 0.0], [0.2, -0.6, 2.5]] {
                 let tag = tag(0.0, turn);
                 let pixels = seen(&camera, &truth, &tag, [[0.0; 2]; 4]);
-                let located = locate(&camera, &[(&tag, pixels)]).expect("a large tag");
+                let located = locate(&at_once(&camera), &[(&tag, pixels)]).expect("a large tag");
                 let [m, rad] = error(&located, &truth);
                 assert!(m < 1e-8 && rad < 1e-8 && located.off_px < 1e-6, "{lens:?} {turn:?}: {m} m, {rad} rad");
             }
@@ -260,7 +322,7 @@ mod tests {
         let (mut chi2, n) = (0.0, 400);
         for _ in 0..n {
             let off = std::array::from_fn(|_| [CORNER_SIGMA_PX * normal(), CORNER_SIGMA_PX * normal()]);
-            let located = locate(&camera, &[(&tag, seen(&camera, &truth, &tag, off))]).expect("a large tag");
+            let located = locate(&at_once(&camera), &[(&tag, seen(&camera, &truth, &tag, off))]).expect("a large tag");
             let off = transform::log(&(located.world_from_camera.inverse() * truth), 1.0);
             let off = Vector6::from_iterator(off.linear_m_s.iter().chain(&off.angular_rad_s).copied());
             let expected = located.covariance * (CORNER_SIGMA_PX / located.off_px.max(CORNER_SIGMA_PX)).powi(2);
@@ -276,8 +338,8 @@ mod tests {
         let (one, other) = (tag(0.0, [0.05, 0.1, 0.0]), tag(0.8, [0.0, -0.2, 0.0]));
         let noise = [[0.3, -0.2], [-0.25, 0.3], [0.2, 0.25], [-0.3, -0.2]];
         let see = |tag: &PlacedTag| seen(&camera, &truth, tag, noise);
-        assert_eq!(locate(&camera, &[(&one, see(&one))]), Err(Unlocated::Ambiguous));
-        let located = locate(&camera, &[(&one, see(&one)), (&other, see(&other))]).expect("two tags");
+        assert_eq!(locate(&at_once(&camera), &[(&one, see(&one))]), Err(Unlocated::Ambiguous));
+        let located = locate(&at_once(&camera), &[(&one, see(&one)), (&other, see(&other))]).expect("two tags");
         let [m, rad] = error(&located, &truth);
         // The other tilt is 0.28 rad away.
         assert!(m < 0.1 && rad < 0.05, "{m} m, {rad} rad");
@@ -292,12 +354,12 @@ mod tests {
             world_from_tag: Transform::translation(0.0, 0.03, 0.0) * other.world_from_tag,
             ..other.clone()
         };
-        let told = locate(&camera, &[(&one, see(&one)), (&moved, see(&other))]);
+        let told = locate(&at_once(&camera), &[(&one, see(&one)), (&moved, see(&other))]);
         assert!(matches!(told, Err(Unlocated::FarOff { off_px }) if off_px > MAX_OFF_PX), "{told:?}");
-        assert_eq!(locate(&camera, &[]), Err(Unlocated::NoTag));
+        assert_eq!(locate(&at_once(&camera), &[]), Err(Unlocated::NoTag));
         let behind = [[f64::NAN; 2]; 4];
-        assert_eq!(locate(&camera, &[(&one, behind)]), Err(Unlocated::NoTag));
+        assert_eq!(locate(&at_once(&camera), &[(&one, behind)]), Err(Unlocated::NoTag));
         let at_one_point = [[100.0, 100.0]; 4];
-        assert!(locate(&camera, &[(&one, at_one_point)]).is_err());
+        assert!(locate(&at_once(&camera), &[(&one, at_one_point)]).is_err());
     }
 }

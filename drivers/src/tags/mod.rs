@@ -7,6 +7,6 @@ mod locate;
 mod spotter;
 mod steady;
 
-pub use locate::{Located, PlacedTag, Unlocated, locate};
+pub use locate::{Located, PlacedTag, Seeing, Unlocated, locate};
 pub use spotter::{Family, Sighting, Spotted, Spotter};
 pub use steady::Steady;
