@@ -59,7 +59,7 @@ pub(crate) struct Leftover {
     /// Why the input broke off, if it did.
     pub(crate) input_error: Option<drivers::Error>,
     /// Why the recording broke off, if it did.
-    pub(crate) recording_error: Option<drivers::Error>,
+    pub(crate) recording_error: Option<anyhow::Error>,
 }
 
 /// The running input.
@@ -149,7 +149,8 @@ impl Pump {
             if let (Some(recorder), None) = (&mut self.input.recorder, &recording_error)
                 && let Err(error) = recorder.write(&sample)
             {
-                log::error!("the recording ends here, the run goes on: {error}");
+                let error = anyhow!(error);
+                log::error!("the recording ends here, the run goes on: {error:#}");
                 recording_error = Some(error);
             }
             if matches!(sample, Sample::Image(_)) {
@@ -167,7 +168,7 @@ impl Pump {
         if let (Some(recorder), None) = (self.input.recorder.take(), &recording_error)
             && let Err(error) = recorder.finish()
         {
-            recording_error = Some(error);
+            recording_error = Some(anyhow!(error));
         }
         Leftover { join: self.input.join, stands: self.input.stands, input_error, recording_error }
     }

@@ -67,6 +67,8 @@ fn a_simulated_franka_rig_comes_through_its_drivers_and_is_moved() {
     let (code, told) = fieldrig(&["move", "--by", "panda_joint1=0.05", "--enable-motion", "--json"], &rig);
     assert_eq!(code, Some(0), "{told}");
     assert!(compare::error_of_move(&told) < 1e-3, "{told}");
+    let (code, told) = fieldrig(&["move", "--by", "panda_joint1=9", "--enable-motion", "--json"], &rig);
+    assert_eq!(code, Some(2), "a slip of the pen does not swing it to the end of its range: {told}");
     let (code, told) = fieldrig(&["move", "--by", "panda_joint1=0.05", "--json"], &rig);
     assert_eq!(code, Some(2), "without a word that it may move it does not: {told}");
     drop(playing);

@@ -3,14 +3,14 @@
 mod franka;
 mod listen;
 
-use crate::config::{Camera, CameraDriver, Rig};
+use crate::config::{BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
 use crate::exit::Exit;
 use crate::print;
 use crate::stop::Stop;
 #[cfg(target_os = "linux")]
 use drivers::v4l2;
 use serde::Serialize;
-use std::net::TcpListener;
+use std::net::{TcpListener, UdpSocket};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 use trainer::gpu::Gpu;
@@ -91,6 +91,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     findings.extend(can(rig.as_ref()));
     findings.extend(franka::franka(rig.as_ref()));
     findings.push(port(USUAL_ADDRESS));
+    findings.extend(rig.iter().flat_map(|rig| senders(rig).into_iter().chain(files(rig))));
     tell(&findings, args.json)?;
     if let (Some(rig), Some(secs)) = (&rig, args.listen) {
         let heard = listen::listen(rig, secs, &Stop::on_ctrl_c()?)?;
@@ -398,6 +399,40 @@ fn port(address: &str) -> Finding {
     }
 }
 
+/// Whether what sends datagrams can be listened to.
+fn senders(rig: &Rig) -> Vec<Finding> {
+    let base = (rig.base.driver == BaseDriver::Udp).then(|| ("base".to_owned(), rig.base.address));
+    let scanners = rig.scanners.iter().filter(|scanner| scanner.driver == ScannerDriver::Udp);
+    let scanners = scanners.map(|scanner| (format!("range scanner {:?}", scanner.name), scanner.address));
+    base.into_iter()
+        .chain(scanners)
+        .map(|(device, address)| match UdpSocket::bind(address) {
+            Ok(_) => Finding::ok("udp", format!("{device}: {address} is free to listen on")),
+            Err(error) => {
+                let says = format!("{device}: {address}: {error}");
+                Finding::fail(
+                    "udp",
+                    says,
+                    "another program listens there, a fieldrig perhaps: end it, or name another address",
+                )
+            }
+        })
+        .collect()
+}
+
+/// Whether the files that cameras play are there.
+fn files(rig: &Rig) -> Vec<Finding> {
+    let missing = |camera: &&Camera| {
+        let file = &camera.realsense.file;
+        camera.driver == CameraDriver::Realsense && !file.as_os_str().is_empty() && !file.is_file()
+    };
+    let tell = |camera: &Camera| {
+        let says = format!("camera {:?}: there is no file {}", camera.name, camera.realsense.file.display());
+        Finding::fail("realsense", says, "camera.NAME.realsense.file is a path from the rig file's folder")
+    };
+    rig.cameras.iter().filter(missing).map(tell).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -464,5 +499,23 @@ mod tests {
         assert_eq!(port(&address).verdict, Verdict::Warn);
         drop(taken);
         assert_eq!(port(&address).verdict, Verdict::Ok);
+    }
+
+    #[test]
+    fn taken_ports_of_senders_and_missing_files_are_told() {
+        let taken = UdpSocket::bind("127.0.0.1:0").expect("a free port");
+        let overrides = [
+            crate::config::Override::new("base.driver", "udp"),
+            crate::config::Override::new("base.address", taken.local_addr().expect("bound").to_string()),
+            crate::config::Override::new("camera.wrist.driver", "realsense"),
+            crate::config::Override::new("camera.wrist.realsense.file", "nowhere.bag"),
+        ];
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
+        let rig = Rig::load(&path, &overrides).expect("a rig file that comes along");
+        assert_eq!(senders(&rig).iter().map(|finding| finding.verdict).collect::<Vec<_>>(), [Verdict::Fail]);
+        drop(taken);
+        assert_eq!(senders(&rig).iter().map(|finding| finding.verdict).collect::<Vec<_>>(), [Verdict::Ok]);
+        let told = files(&rig);
+        assert!(told.len() == 1 && told[0].says.contains("nowhere.bag"), "{told:?}");
     }
 }

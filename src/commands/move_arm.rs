@@ -14,6 +14,8 @@ use serde::Serialize;
 use std::path::PathBuf;
 use std::time::Duration;
 
+/// Targets this near to the end of a range are in it, rad or m.
+const TOLD_RAD: f64 = 1e-4;
 /// How soon Ctrl-C is noticed.
 const POLL: Duration = Duration::from_millis(50);
 /// A movable arm that says nothing for so long is lost, whatever it was asked for.
@@ -85,9 +87,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let at_first = mover.read()?;
     if args.to.is_some() || !args.by.is_empty() {
         let wanted = target(args, &rig.arm.joints, &at_first);
+        check_range(&rig, &wanted, &at_first)?;
         let target = mover.command(&wanted)?;
         for (joint, (wanted, taken)) in rig.arm.joints.iter().zip(wanted.position.iter().zip(&target.position)) {
-            if (wanted - taken).abs() > 1e-9 {
+            if (wanted - taken).abs() > TOLD_RAD {
                 log::warn!("joint {joint:?} is sent to {taken:.4}, the end of its range, rather than {wanted:.4}");
             }
         }
@@ -112,6 +115,24 @@ fn check(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
     }
     if let Some((joint, _)) = args.by.iter().find(|(joint, _)| !joints.contains(joint)) {
         return Err(BadArgument(format!("--by: there is no joint {joint:?}, but {}", joints.join(", "))));
+    }
+    Ok(())
+}
+
+/// Refuses a target outside the ranges of the arm's description: a slip of the pen is not to swing an arm to the end of its range. A
+/// joint that is outside already may stay.
+fn check_range(rig: &Rig, wanted: &JointTarget, now: &JointState) -> anyhow::Result<()> {
+    let chain = open::chain_of(rig)?;
+    for (ix, joint) in rig.arm.joints.iter().enumerate() {
+        let Some(place) = chain.joint_names().iter().position(|known| known == joint) else { continue };
+        let (lower, upper) = (chain.limits()[place].lower, chain.limits()[place].upper);
+        let (wanted, now) = (wanted.position[ix], now.position[ix]);
+        if (wanted - now).abs() > TOLD_RAD && !(lower - TOLD_RAD..=upper + TOLD_RAD).contains(&wanted) {
+            return Err(BadArgument(format!(
+                "joint {joint:?} would go to {wanted:.4}, outside its range of {lower:.4} to {upper:.4}; it is at {now:.4}, and nothing was moved"
+            ))
+            .into());
+        }
     }
     Ok(())
 }

@@ -188,8 +188,7 @@ fn save(live: Live, args: &Args, rig: &Rig, folders: Vec<PathBuf>, damage: &Once
     log::info!("{counts}");
     let mut losses =
         counts.losses(if args.record.is_some() && args.from.is_none() { Use::Recorded } else { Use::Watched });
-    let recording_error = leftover.recording_error.map(anyhow::Error::new);
-    losses.extend(recording_error.map(|error| format!("the recording is cut off: {error:#}")));
+    losses.extend(leftover.recording_error.map(|error| format!("the recording is cut off: {error:#}")));
     losses.extend(damage.get().cloned());
     let stands = leftover.stands.as_ref().map_or(Vec::new(), |stands| stands.reports().to_vec());
     let ending = |(session, out): (Session, PathBuf)| Ending {
@@ -328,7 +327,11 @@ mod tests {
             (0, counts(1, 1, &[]), "ended before the trainer took its first keyframe"),
             (0, counts(0, 0, &[]), "no image came"),
             (0, counts(7, 0, &[(Refusal::UnknownCamera, 7)]), "(\"wrist\"): all 7 are of \"front\""),
-            (0, counts(7, 0, &[(Refusal::NoPose, 7)]), "0 keyframes of 7 images; 7 no joint readings"),
+            (
+                0,
+                counts(7, 0, &[(Refusal::NoPose, 7)]),
+                "0 keyframes of 7 images; 7 no joint readings or pose of the base",
+            ),
         ] {
             let told = nothing_to_train(n_keyframes, &counts, &rig);
             assert!(told.contains(expected), "{told}");

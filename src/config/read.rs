@@ -182,7 +182,7 @@ fn arm(mut keys: Section<'_>) -> (Arm, String) {
         joint_offsets: keys.number_list("joint_offsets").unwrap_or_default(),
         base_link: keys.text("base_link").unwrap_or_default(),
         flange_link: flange_link.unwrap_or_default(),
-        max_speed_rad_s: keys.number("max_speed_rad_s", 0.0..=10.0).unwrap_or(0.5),
+        max_speed_rad_s: keys.number("max_speed_rad_s", 0.001..=10.0).unwrap_or(0.5),
         rate_hz: keys.number("rate_hz", 1.0..=2000.0).unwrap_or(200.0),
         buses,
         motors,
@@ -220,10 +220,9 @@ fn base(mut keys: Section<'_>) -> Base {
 
 /// A tag with its number; `None` where something is wrong, which has been told.
 fn tag(id: &str, mut keys: Section<'_>) -> Option<(u32, PlacedTag)> {
-    let id = id
-        .parse()
-        .ok()
-        .or_else(|| keys.wrong("id", &Value::from(id), "the number of a tag in its family, as the table's name"));
+    let number = id.parse().ok().filter(|number: &u32| number.to_string() == id);
+    let id =
+        number.or_else(|| keys.wrong("id", &Value::from(id), "the number of a tag in its family, as the table's name"));
     let size_m = keys.number("size_m", 0.001..=10.0);
     if size_m.is_none() {
         keys.missing("size_m", "the side of the tag's border, where black meets white, m");

@@ -55,7 +55,7 @@ impl std::fmt::Display for Refusal {
         f.write_str(match self {
             Self::UnknownCamera => "camera not in the rig file",
             Self::Crowded => "too many waited for joint readings",
-            Self::NoPose => "no joint readings around the stamp",
+            Self::NoPose => "no joint readings or pose of the base around the stamp",
             Self::PoseNotFinite => "pose is not a number",
             Self::NotMoved => "not moved",
             Self::Blur => "motion blur",

@@ -110,7 +110,7 @@ pub(crate) fn recorder(path: &Path, rig: &Rig) -> anyhow::Result<Recorder> {
 }
 
 /// The joints from the robot's base to its flange.
-fn chain_of(rig: &Rig) -> anyhow::Result<Chain> {
+pub(crate) fn chain_of(rig: &Rig) -> anyhow::Result<Chain> {
     let arm = &rig.arm;
     Chain::from_urdf(&arm.urdf_text, &arm.base_link, &arm.flange_link).context("the arm's URDF")
 }

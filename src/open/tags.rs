@@ -2,6 +2,7 @@
 
 use crate::config::{BaseDriver, Camera, Parent, Rig};
 use crate::join::{Motion, Posed};
+use anyhow::bail;
 use drivers::tags::{PlacedTag, Seeing, Sighting, Spotter, Steady, Unlocated, locate};
 use drivers::{BasePose, Error, Image, Sample, Source};
 use kinematics::{HistoryError, Stamp, Transform, Twist};
@@ -50,11 +51,17 @@ impl WithTags {
         let mut arm = rig.clone();
         (arm.base.driver, arm.base.world_from_base) = (BaseDriver::Fixed, Transform::identity());
         let is_carried = |camera: &&Camera| camera.parent != Parent::World;
+        let cameras: Vec<_> = rig.cameras.iter().filter(is_carried).cloned().collect();
+        if cameras.is_empty() {
+            bail!(
+                "base.driver is tags, and no camera is on the base or the arm (camera.NAME.parent): none would see them move"
+            );
+        }
         Ok(Self {
             source,
             spotter: Spotter::start(rig.base.tag_family)?,
             is_patient: rig.sim.lockstep,
-            cameras: rig.cameras.iter().filter(is_carried).cloned().collect(),
+            cameras,
             tags: rig.base.tags.clone(),
             arm: Motion::new(&arm)?,
             waiting: VecDeque::new(),

@@ -62,7 +62,7 @@ impl Link {
         let details = CanInterface::open(interface).and_then(|open| open.details());
         details.map(|details| Self::of(interface, &details)).map_err(|error| {
             let reason = match told(error) {
-                error if error.raw_os_error() == Some(ENODEV) => missing(),
+                error if error.raw_os_error() == Some(ENODEV) => missing(interface),
                 error => error,
             };
             Error::CanBus { interface: interface.to_owned(), reason }
@@ -185,7 +185,15 @@ fn set_up(interface: &str, is_virtual: bool, wanted: &BusConfig) -> String {
 /// The system's number for "no such device".
 const ENODEV: i32 = 19;
 
-fn missing() -> io::Error {
+fn missing(interface: &str) -> io::Error {
+    if interface.starts_with("vcan") {
+        let mend =
+            format!("sudo modprobe vcan; sudo ip link add dev {interface} type vcan; sudo ip link set {interface} up");
+        return io::Error::new(
+            io::ErrorKind::NotFound,
+            format!("no such interface; a virtual one is made with: {mend}"),
+        );
+    }
     let others = match interfaces(Path::new("/sys")).as_slice() {
         [] => "this machine has none; is the adapter plugged in, and its driver loaded?".to_owned(),
         names => format!("there is {}", names.join(", ")),

@@ -117,7 +117,7 @@ pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Heard>
         findings.push(Finding::ok("processor", cpu_told(cpu - cpu_began, began.elapsed())));
     }
     let wanted = wanted(&rig);
-    findings.extend(missing(&wanted, &tracks));
+    findings.extend(missing(&rig, &wanted, &tracks));
     let devices: Vec<_> = tracks
         .into_iter()
         .map(|(device, track)| {
@@ -158,9 +158,15 @@ fn wanted(rig: &Rig) -> BTreeMap<String, Option<f64>> {
     wanted
 }
 
-fn missing(wanted: &BTreeMap<String, Option<f64>>, tracks: &BTreeMap<String, Track>) -> Vec<Finding> {
+fn missing(rig: &Rig, wanted: &BTreeMap<String, Option<f64>>, tracks: &BTreeMap<String, Track>) -> Vec<Finding> {
     let silent = wanted.keys().filter(|device| !tracks.contains_key(*device));
-    silent.map(|device| Finding::fail("silent", format!("{device} said nothing"), "look at it and its cable")).collect()
+    let mend = |device: &str| match rig.base.driver {
+        BaseDriver::Tags if device == "base" => {
+            "no image told where it is: look at base.tag_family, and at sizes and places of the tags"
+        }
+        _ => "look at it and its cable",
+    };
+    silent.map(|device| Finding::fail("silent", format!("{device} said nothing"), mend(device))).collect()
 }
 
 /// What is wrong with how a device delivers.

@@ -121,6 +121,13 @@ fn simulate(args: &Args, rig: &Rig, folder: &Path, stop: &Stop) -> anyhow::Resul
     simulated.sim.lockstep = true;
     let Opened { rig, mut source, .. } = open::rig(simulated, Devices::Sim)?;
     let path = folder.join(SCRIPT_FILE);
+    // Of an earlier time, or of one that was interrupted.
+    match std::fs::remove_file(&path) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            return Err(error).with_context(|| format!("cannot replace {}", path.display()));
+        }
+        _ => {}
+    }
     let mut recorder = open::recorder(&path, &rig)?;
     let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
     let mut first: Option<Stamp> = None;
@@ -259,8 +266,11 @@ fn wait(stop: &Stop, begins: Stamp, args: &Args) -> anyhow::Result<()> {
             _ if secs < args.seconds => format!("{secs:.1} of {:.1} s played", args.seconds),
             _ => "played to the end; everything stands still until Ctrl-C".to_owned(),
         });
-        if secs >= args.seconds && !std::mem::replace(&mut is_over, true) && args.json {
-            print::json(&serde_json::json!({ "event": "over" }))?;
+        if secs >= args.seconds && !std::mem::replace(&mut is_over, true) {
+            match args.json {
+                true => print::json(&serde_json::json!({ "event": "over" }))?,
+                false => print::line("Played to the end: everything stands still, and answers until Ctrl-C.")?,
+            }
         }
         std::thread::sleep(POLL);
     }
