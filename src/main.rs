@@ -33,6 +33,9 @@ mod shrink;
 mod splat_file;
 mod stands;
 mod stop;
+#[cfg(test)]
+#[path = "../tests/common/test_data.rs"]
+mod test_data;
 mod training;
 mod training_args;
 mod turns;

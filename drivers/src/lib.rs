@@ -22,6 +22,7 @@ pub mod recording;
 mod sample;
 pub mod tags;
 #[cfg(test)]
+#[path = "../../tests/common/test_data.rs"]
 mod test_data;
 pub mod udp;
 pub mod v4l2;

@@ -3,6 +3,7 @@
 mod franka;
 mod listen;
 
+use super::within;
 use crate::config::{BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
 use crate::exit::Exit;
 use crate::print;
@@ -28,18 +29,11 @@ pub(crate) struct Args {
     /// Rig file: what it names is checked against what it wants
     rig: Option<PathBuf>,
     /// Then read the rig's devices for S seconds and tell rates, latencies and losses; nothing is moved
-    #[arg(long, value_name = "S", requires = "rig", value_parser = seconds)]
+    #[arg(long, value_name = "S", requires = "rig", value_parser = within(1.0..=3600.0))]
     listen: Option<f64>,
     /// Print one JSON object a line
     #[arg(long)]
     json: bool,
-}
-
-fn seconds(text: &str) -> Result<f64, String> {
-    match text.parse() {
-        Ok(seconds) if (1.0..=3600.0).contains(&seconds) => Ok(seconds),
-        _ => Err("allowed are 1 to 3600".to_owned()),
-    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]

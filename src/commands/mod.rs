@@ -16,8 +16,17 @@ pub(crate) mod train;
 
 use crate::cli::Command;
 use crate::exit::{BadArgument, Exit};
+use std::ops::RangeInclusive;
 use std::sync::Arc;
 use trainer::gpu::{Gpu, GpuOptions};
+
+/// Reads a number of a flag, which has to lie within a range.
+fn within(range: RangeInclusive<f64>) -> impl Fn(&str) -> Result<f64, String> + Clone + Send + Sync {
+    move |text| {
+        let number = text.parse().ok().filter(|number| range.contains(number));
+        number.ok_or_else(|| format!("allowed are {} to {}", range.start(), range.end()))
+    }
+}
 
 /// Runs a command.
 pub(crate) fn run(command: Command) -> anyhow::Result<Exit> {

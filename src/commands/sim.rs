@@ -1,5 +1,6 @@
 //! `fieldrig sim`: a rig's devices on the wire, for the drivers of `fieldrig run` or of anyone else.
 
+use super::within;
 use crate::exit::Exit;
 use std::path::PathBuf;
 
@@ -15,13 +16,13 @@ pub(crate) struct Args {
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Seconds to play; then everything stands still until Ctrl-C (30 to 40 MB a second of an RGB-D camera go into the folder)
-    #[arg(long, value_name = "S", default_value_t = 60.0, value_parser = seconds)]
+    #[arg(long, value_name = "S", default_value_t = 60.0, value_parser = within(0.1..=86_400.0))]
     seconds: f64,
     /// Play this recording of the same rig instead of a simulation
     #[arg(long, value_name = "REC.mcap")]
     from: Option<PathBuf>,
     /// Seconds from when all is ready to when playing begins: time to start the other program
-    #[arg(long, value_name = "S", default_value_t = 10.0, value_parser = seconds)]
+    #[arg(long, value_name = "S", default_value_t = 10.0, value_parser = within(0.1..=86_400.0))]
     start_in: f64,
     /// Version of FCI that a Franka controller speaks: 5 (Panda) or 10 (FR3)
     #[arg(long, value_name = "VERSION", default_value = "10", value_parser = ["5", "10"])]
@@ -29,13 +30,6 @@ pub(crate) struct Args {
     /// Print one JSON object a line
     #[arg(long)]
     json: bool,
-}
-
-fn seconds(text: &str) -> Result<f64, String> {
-    match text.parse() {
-        Ok(seconds) if (0.1..=86_400.0).contains(&seconds) => Ok(seconds),
-        _ => Err("allowed are 0.1 to 86400".to_owned()),
-    }
 }
 
 /// Simulates the rig, then plays it until Ctrl-C.

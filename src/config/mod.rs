@@ -20,7 +20,7 @@ use drivers::can::{BusConfig, MotorConfig};
 use drivers::realsense::{Filter, Pace, Stream};
 use drivers::tags::{Family, PlacedTag};
 use drivers::v4l2::{Delivery, V4l2Format};
-use kinematics::{Intrinsics, Transform};
+use kinematics::{Intrinsics, Stamp, Transform};
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::ops::RangeInclusive;
@@ -171,6 +171,14 @@ pub(crate) struct Camera {
     pub(crate) v4l2: V4l2,
     pub(crate) realsense: Realsense,
     pub(crate) sim: CameraSim,
+}
+
+impl Camera {
+    /// The middle of the exposure of an image that the device gave this stamp.
+    pub(crate) fn mid_exposure(&self, device_stamp: Stamp) -> Stamp {
+        let offset = self.stamp_to_mid_exposure.as_ref();
+        offset.map_or(device_stamp, |offset| device_stamp.plus_secs(offset.value_millis * 1e-3))
+    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

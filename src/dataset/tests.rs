@@ -1,19 +1,10 @@
 //! From dataset folders to keyframes.
 
 use super::*;
+use crate::test_data;
 use image::{GrayImage, Luma, RgbImage};
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
-
-fn shared(name: &str) -> Option<PathBuf> {
-    let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
-    let folder = std::env::var_os("FIELDRIG_TEST_DATA").map_or_else(beside, PathBuf::from).join(name);
-    if !folder.is_dir() {
-        eprintln!("skipped: no test data at {}", folder.display());
-        return None;
-    }
-    Some(folder)
-}
+use std::path::Path;
 
 /// A folder with `n` photos of 64 x 48 pixels, brighter to the right, all from one place, through `lens`.
 fn folder_of(n: usize, lens: &Value) -> tempfile::TempDir {
@@ -38,7 +29,7 @@ fn load_at(folder: &Path, scale_frac: f64) -> anyhow::Result<Loaded> {
 
 #[test]
 fn fox_becomes_undistorted_keyframes() {
-    let Some(folder) = shared("fox") else { return };
+    let Some(folder) = test_data::folder("fox") else { return };
     let most_done = AtomicUsize::new(0);
     let dataset = drivers::dataset::read(&folder).unwrap();
     let told = |n_done| _ = most_done.fetch_max(n_done, Ordering::Relaxed);
@@ -55,7 +46,7 @@ fn fox_becomes_undistorted_keyframes() {
 
 #[test]
 fn redkitchen_keeps_its_depth() {
-    let Some(folder) = shared("redkitchen") else { return };
+    let Some(folder) = test_data::folder("redkitchen") else { return };
     let loaded = load_at(&folder, 0.5).unwrap();
     let depth = loaded.keyframes[3].depth.as_ref().unwrap();
     assert_eq!((loaded.keyframes[3].size_px, depth.size_px), ([320, 240], [640, 480]));

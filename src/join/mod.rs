@@ -191,10 +191,10 @@ impl Join {
             return;
         };
         if image.is_depth() {
-            let stamp = camera.mid_exposure(image.stamp);
+            let stamp = camera.config.mid_exposure(image.stamp);
             camera.waiting.push_depth(stamp, image);
         } else if let Some(crowded) = camera.waiting.push_color(image) {
-            let stamp = camera.mid_exposure(crowded.stamp);
+            let stamp = camera.config.mid_exposure(crowded.stamp);
             self.refuse(&crowded.camera, stamp, Refusal::Crowded, events);
         }
     }
@@ -222,7 +222,7 @@ impl Join {
     fn next_ripe(&mut self, camera_ix: usize, at_end: bool) -> Option<Result<Ripe, (Arc<str>, Stamp)>> {
         let camera = &mut self.cameras[camera_ix];
         let device_stamp = camera.waiting.oldest()?.stamp;
-        let stamp = camera.mid_exposure(device_stamp);
+        let stamp = camera.config.mid_exposure(device_stamp);
         let overdue = at_end || self.newest.secs_since(stamp) > self.max_wait_secs;
         let posed = match self.motion.at(&camera.config, stamp) {
             Err(HistoryError::NotYet { .. }) if !overdue => return None,
@@ -317,11 +317,6 @@ impl CameraState {
             n_accepted: 0,
             warned: false,
         })
-    }
-
-    fn mid_exposure(&self, device_stamp: Stamp) -> Stamp {
-        let offset = self.config.stamp_to_mid_exposure.as_ref();
-        offset.map_or(device_stamp, |offset| device_stamp.plus_secs(offset.value_millis * 1e-3))
     }
 
     /// The keyframe of an image, or why it becomes none; `judge` is off where a list has decided already.

@@ -72,8 +72,7 @@ pub(crate) fn movable_arm(rig: &Rig) -> anyhow::Result<Box<dyn MovableArm>> {
 #[cfg(target_os = "linux")]
 fn motion_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MotionConfig> {
     let Rig { arm, .. } = rig;
-    let chain =
-        kinematics::Chain::from_urdf(&arm.urdf_text, &arm.base_link, &arm.flange_link).context("the arm's URDF")?;
+    let chain = super::chain_of(rig)?;
     let mut limits = Vec::new();
     for (ix, name) in arm.joints.iter().enumerate() {
         let place = chain.joint_names().iter().position(|known| known == name);

@@ -109,7 +109,7 @@ impl WithTags {
     fn settle(&mut self) {
         while let Some(sighting) = self.waiting.front() {
             let Some(camera) = self.camera(&sighting.camera) else { return };
-            let stamp = mid_exposure(camera, sighting.stamp);
+            let stamp = camera.mid_exposure(sighting.stamp);
             match self.arm.at(camera, stamp) {
                 Ok(posed) => self.locate(stamp, &posed),
                 Err(HistoryError::NotYet { .. }) => return,
@@ -202,11 +202,6 @@ impl Drop for WithTags {
              {n_ambiguous} ambiguous, {n_far_off} that fit no pose, {n_unsure} too unsure, {n_without_joints} without joint states)"
         );
     }
-}
-
-fn mid_exposure(camera: &Camera, stamp: Stamp) -> Stamp {
-    let offset = camera.stamp_to_mid_exposure.as_ref().map_or(0.0, |offset| offset.value_millis);
-    stamp.plus_secs(offset * 1e-3)
 }
 
 /// The covariance of the base's pose, in its own axes, by that of a camera on it.

@@ -22,6 +22,7 @@ pub mod sort;
 pub mod splat;
 pub mod spz;
 #[cfg(test)]
+#[path = "../../tests/common/test_data.rs"]
 mod test_data;
 #[cfg(test)]
 mod test_scenes;
