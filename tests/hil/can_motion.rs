@@ -284,6 +284,35 @@ fn motors_of_all_families_go_where_they_are_sent_and_back() {
 
 #[test]
 #[ignore = "needs the virtual kernel"]
+fn motors_without_a_watchdog_are_told_until_they_have_heard_it() {
+    let wire = Wire::new("vcan13", false);
+    let configs: Vec<_> =
+        all_families().into_iter().filter(|config| matches!(config.family, Family::TMotor { .. })).collect();
+    // The program ends in order, and while the arm looks on the cable fails: nothing of what is said then arrives.
+    for is_dropped in [true, false] {
+        let motors = Motors::new(wire.config(false), configs.clone(), false);
+        let arm = MovableCanArm::open(&movable(wire.config(false), &configs, OnLoss::Release)).expect("it is there");
+        assert_eq!(motors.states(), [State::Obeys]);
+        motors.is_cut.store(true, Ordering::Relaxed);
+        std::thread::scope(|threads| {
+            let kept = if is_dropped {
+                threads.spawn(|| drop(arm));
+                None
+            } else {
+                wait_until_stopped(&arm);
+                Some(arm)
+            };
+            std::thread::sleep(TIMEOUT / 2);
+            assert_eq!(motors.states(), [State::Obeys], "it obeys its last command as long as it hears nothing else");
+            motors.is_cut.store(false, Ordering::Relaxed);
+            motors.wait_until("they are released", |seen| seen.iter().all(|seen| seen.state == State::Free));
+            drop(kept);
+        });
+    }
+}
+
+#[test]
+#[ignore = "needs the virtual kernel"]
 fn commands_keep_the_limits_and_joints_arrive_together() {
     let wire = Wire::new("vcan7", false);
     let second = Wire::new("vcan8", false);

@@ -208,7 +208,7 @@ impl Mover {
     }
 
     /// What switches it off.
-    pub(super) fn release(&self) -> Result<Vec<Frame>, CanError> {
+    fn release(&self) -> Result<Vec<Frame>, CanError> {
         let frame = match self.motor.config().family {
             Family::Damiao { motor, .. } => damiao::encode_order(motor, damiao::Order::Disable),
             Family::Robstride { motor, .. } => {

@@ -13,9 +13,9 @@ use super::movable::MovableArmConfig;
 use super::mover::{Health, Mover};
 use super::pace::affordable_hz;
 use super::watchdog::Plan;
-use crate::motion::{Generator, JointTarget, Motion, MotionLimits};
+use crate::motion::{Generator, JointTarget, Motion, MotionLimits, OnLoss};
+use crate::wire::can::Frame;
 use crate::wire::can::canopen::{self, NodeState};
-use crate::wire::can::{CanError, Frame};
 use crate::{Error, clock};
 use kinematics::Stamp;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -33,6 +33,8 @@ const MIN_UNHEARD: u64 = 3;
 const MAX_STARTING: Duration = Duration::from_secs(2);
 /// A queue of ten frames, as interfaces have it, is half empty after so long.
 const MAX_QUEUED: Duration = Duration::from_micros(800);
+/// Last words may wait so long for room in the queue; one that stays full has nobody who listens.
+const MAX_LAST_QUEUED: Duration = Duration::from_millis(5);
 /// How soon a thread with nothing to do looks whether it is asked for something.
 const POLL: Duration = Duration::from_millis(20);
 /// Beyond the time that its limits need, an arm that ends may take so long to come to rest.
@@ -54,8 +56,8 @@ pub(super) enum Request {
 /// What is being done.
 #[derive(Debug)]
 enum Phase {
-    /// Nothing is commanded since.
-    Stopped { since: Stamp, reason: String },
+    /// Nothing is commanded since; what the motors were told to do is told again as long as some may not have heard it.
+    Stopped { since: Stamp, reason: String, told: Option<OnLoss> },
     /// All motors are ready and off, and are asked where they are.
     Measuring { since: Stamp, asked: Answer<()> },
     /// They are commanded to stay there, and switched on.
@@ -130,7 +132,7 @@ impl Moving {
             );
             return Err(Error::Motion { reason });
         }
-        let phase = Phase::Stopped { since: clock::now(), reason: String::new() };
+        let phase = Phase::stopped(clock::now(), None);
         Ok(Self {
             config: config.clone(),
             plan,
@@ -205,7 +207,7 @@ impl Moving {
                 }
                 Err(error) => {
                     self.ready = None;
-                    self.stopped(&reason_of(&error));
+                    self.stopped(&reason_of(&error), None);
                     let _ = answer.try_send(Err(error));
                 }
             },
@@ -253,6 +255,7 @@ impl Moving {
                     // A lost bus has been told.
                     let _ = ready.ask_stopped();
                 }
+                self.insist(now);
                 return Ok(());
             }
             Phase::Measuring { since, .. } => {
@@ -260,8 +263,7 @@ impl Moving {
                     let limits = ready.limits(&self.config.motion.limits);
                     let generator = Generator::new(&limits, &positions, self.plan.period).map_err(motion)?;
                     ready.movers.iter_mut().for_each(Mover::forget);
-                    let Phase::Measuring { asked, .. } =
-                        std::mem::replace(&mut self.phase, Phase::Stopped { since: now, reason: String::new() })
+                    let Phase::Measuring { asked, .. } = std::mem::replace(&mut self.phase, Phase::stopped(now, None))
                     else {
                         return Ok(());
                     };
@@ -306,8 +308,8 @@ impl Moving {
             }
         }
         // All obey.
-        let stopped = Phase::Stopped { since: now, reason: String::new() };
-        if let Phase::Enabling { generator, asked, .. } = std::mem::replace(&mut self.phase, stopped) {
+        if let Phase::Enabling { generator, asked, .. } = std::mem::replace(&mut self.phase, Phase::stopped(now, None))
+        {
             self.phase = Phase::Moving { generator };
             *self.motion.lock().unwrap_or_else(PoisonError::into_inner) = Motion::Held;
             log::info!("the arm is switched on and held");
@@ -357,25 +359,26 @@ impl Moving {
         Ok(())
     }
 
-    /// Stops commanding: each motor is told once what it would do by itself soon, and what is wrong is told.
+    /// Stops commanding: each motor is told what it would do by itself soon, and what is wrong is told.
     fn give_up(&mut self, reason: &str) {
         if let Phase::Stopped { .. } = self.phase {
             return;
         }
-        let is_starting = !matches!(self.phase, Phase::Moving { .. });
-        if let Some(ready) = &mut self.ready {
-            // An arm that was not switched on as a whole is switched off as a whole.
-            ready.leave(|mover, sent_rad| match is_starting {
-                true => mover.release(),
-                false => mover.leave(self.plan.on_loss, sent_rad),
-            });
+        let words = self.last_words();
+        if let Some(ready) = &self.ready {
+            ready.leave(words, |_| true);
         }
-        self.stopped(reason);
+        self.stopped(reason, Some(words));
     }
 
-    fn stopped(&mut self, reason: &str) {
+    /// An arm that was not switched on as a whole is switched off as a whole.
+    fn last_words(&self) -> OnLoss {
+        if matches!(self.phase, Phase::Moving { .. }) { self.plan.on_loss } else { OnLoss::Release }
+    }
+
+    fn stopped(&mut self, reason: &str, told: Option<OnLoss>) {
         log::warn!("the arm stopped: {reason}");
-        let stopped = Phase::Stopped { since: clock::now(), reason: reason.to_owned() };
+        let stopped = Phase::Stopped { since: clock::now(), reason: reason.to_owned(), told };
         let before = std::mem::replace(&mut self.phase, stopped);
         *self.motion.lock().unwrap_or_else(PoisonError::into_inner) = Motion::Stopped { reason: reason.to_owned() };
         if let Phase::Measuring { asked, .. } | Phase::Enabling { asked, .. } = before {
@@ -403,26 +406,58 @@ impl Moving {
 
     /// The last words.
     fn end(mut self) {
-        let is_starting = matches!(self.phase, Phase::Measuring { .. } | Phase::Enabling { .. });
-        if let Some(ready) = &mut self.ready
+        let words = self.last_words();
+        if let Some(ready) = &self.ready
             && !matches!(self.phase, Phase::Stopped { .. })
         {
-            ready.leave(|mover, sent_rad| match is_starting {
-                true => mover.release(),
-                false => mover.leave(self.plan.on_loss, sent_rad),
-            });
+            ready.leave(words, |_| true);
             log::info!(
                 "the arm is left with on_loss = {:?}; {} cycles, {} of them late, {:.1} ms at most",
-                self.plan.on_loss.word(),
+                words.word(),
                 ready.cycle_ix,
                 self.n_late,
                 1e3 * self.latest.as_secs_f64()
             );
+            self.phase = Phase::stopped(clock::now(), Some(words));
         }
+        while let Phase::Stopped { told: Some(_), .. } = self.phase {
+            std::thread::sleep(self.plan.period);
+            // A bus that is lost has been told.
+            let _ = self.listen(Duration::ZERO);
+            self.insist(clock::now());
+        }
+    }
+
+    /// Motors without a watchdog would go on for ever where they did not hear the last words: they are told again, once a cycle, for as
+    /// long as the others take to notice that nothing comes any more, and until they say something.
+    fn insist(&mut self, now: Stamp) {
+        let (Some(ready), Phase::Stopped { since, told, .. }) = (&self.ready, &mut self.phase) else { return };
+        let Some(words) = *told else { return };
+        let is_deaf = |mover: &Mover| !self.plan.has_watchdog(&mover.config().family);
+        ready.leave(words, is_deaf);
+        let enough = *since + self.plan.timeout;
+        let all = ready.movers.iter().zip(&ready.heard);
+        let silent: Vec<_> = all.filter(|(mover, heard)| is_deaf(mover) && heard.0 < enough).collect();
+        if now < enough + MAX_STARTING && !silent.is_empty() {
+            return;
+        }
+        for (mover, _) in silent {
+            log::error!(
+                "joint {:?}: its motor has no watchdog and says nothing since it was told to {}; it may still obey its last command: \
+                 cut its power",
+                mover.config().joint,
+                words.word()
+            );
+        }
+        *told = None;
     }
 }
 
 impl Phase {
+    fn stopped(since: Stamp, told: Option<OnLoss>) -> Self {
+        Self::Stopped { since, reason: String::new(), told }
+    }
+
     /// Why no target is taken.
     fn refusal(&self) -> Error {
         motion(match self {
@@ -548,11 +583,11 @@ impl Ready {
         Ok(())
     }
 
-    /// Says the last words to each motor, as far as there is a bus to say them on.
-    fn leave(&self, words: impl Fn(&Mover, f64) -> Result<Vec<Frame>, CanError>) {
-        for (mover, sent_rad) in self.movers.iter().zip(&self.sent_rad) {
-            for frame in words(mover, *sent_rad).unwrap_or_default() {
-                let _ = self.bus_of(mover).send_within(&frame, MAX_QUEUED);
+    /// Says the last words to these motors, as far as there is a bus to say them on.
+    fn leave(&self, words: OnLoss, whom: impl Fn(&Mover) -> bool) {
+        for (mover, sent_rad) in self.movers.iter().zip(&self.sent_rad).filter(|(mover, _)| whom(mover)) {
+            for frame in mover.leave(words, *sent_rad).unwrap_or_default() {
+                let _ = self.bus_of(mover).send_within(&frame, MAX_LAST_QUEUED);
             }
         }
     }
