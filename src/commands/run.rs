@@ -42,7 +42,7 @@ pub(crate) struct Args {
     /// Replay a recording instead of live devices
     #[arg(long, value_name = "RECORDING")]
     from: Option<PathBuf>,
-    /// Write everything that comes in to an MCAP file
+    /// Write everything that comes in to an MCAP file; what devices lose then is a loss (exit code 3), else the next image does
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
     /// Stop after S seconds, counted from the first image [default: run until Ctrl-C]
@@ -180,10 +180,12 @@ fn save(live: Live, args: &Args, rig: &Rig, folders: Vec<PathBuf>, damage: &Once
     let n_train = live.keyframes().iter().filter(|keyframe| keyframe.split == Split::Train).count();
     let live_error_m = worst_position_error_m(live.keyframes());
     let (sessions, leftover) = live.finish();
-    for (session, folder) in sessions.iter().zip(&folders) {
-        run_folder::write_keyframe_list(&folder.join("keyframes.txt"), session.keyframes())?;
-    }
     let leftover = leftover?;
+    // A disk that has no room for these may have some for the models.
+    let list = |(session, folder): (&Session, &PathBuf)| {
+        run_folder::write_keyframe_list(&folder.join("keyframes.txt"), session.keyframes())
+    };
+    let listed = sessions.iter().zip(&folders).try_for_each(list);
     let counts = leftover.join.counts();
     log::info!("{counts}");
     let mut losses =
@@ -211,6 +213,7 @@ fn save(live: Live, args: &Args, rig: &Rig, folders: Vec<PathBuf>, damage: &Once
     if n_train > 0 {
         session::finish(sessions.into_iter().zip(folders).map(ending).collect())?;
     }
+    listed?;
     if let Some(error) = leftover.input_error {
         return Err(anyhow::Error::new(error).context("the devices broke off"));
     }

@@ -7,6 +7,7 @@ use super::{
     USUAL_SEED, Unknown, V4l2,
 };
 use crate::method::Kind;
+use drivers::can::MotorConfig;
 use drivers::realsense::{Filter, Pace, Stream};
 use drivers::tags::{Family, PlacedTag};
 use drivers::v4l2::{Delivery, V4l2Format};
@@ -152,6 +153,14 @@ fn settle_motors(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
     if let Some(joint) = arm.joints.iter().find(|joint| !arm.motors.iter().any(|motor| motor.joint == **joint)) {
         return Err(problem(format!("the joint {joint:?} has no table [arm.motor.{joint}]")));
     }
+    for (ix, motor) in arm.motors.iter().enumerate() {
+        let is_same = |other: &&MotorConfig| other.bus_ix == motor.bus_ix && other.family.clashes(&motor.family);
+        if let Some(same) = arm.motors[..ix].iter().find(is_same) {
+            let interface = &arm.buses[motor.bus_ix].interface;
+            let told = format!("{:?} and {:?} have the same number on {interface:?}", same.joint, motor.joint);
+            return Err(problem(told));
+        }
+    }
     let mut motors = std::mem::take(&mut arm.motors);
     motors.sort_by_key(|motor| place(&motor.joint));
     arm.motors = motors;
@@ -193,7 +202,9 @@ fn arm(mut keys: Section<'_>) -> (Arm, String) {
 }
 
 fn base(mut keys: Section<'_>) -> Base {
-    let tags: BTreeMap<_, _> = keys.named_sections("tag").into_iter().filter_map(|(id, keys)| tag(&id, keys)).collect();
+    let tag_family = keys.choice("tag_family", &TAG_FAMILIES).unwrap_or(Family::Tag36h11);
+    let tags = keys.named_sections("tag").into_iter().filter_map(|(id, keys)| tag(&id, tag_family, keys));
+    let tags: BTreeMap<_, _> = tags.collect();
     let mut flaws = keys.section("sim");
     let (drift_m, drift_rad) = (flaws.number("drift_m", 0.0..=10.0), flaws.number("drift_rad", 0.0..=1.0));
     flaws.end();
@@ -209,7 +220,7 @@ fn base(mut keys: Section<'_>) -> Base {
         realign: keys.flag("realign").unwrap_or(true),
         max_sigma_m: keys.number("max_sigma_m", 0.0001..=100.0).unwrap_or(0.05),
         max_sigma_rad: keys.number("max_sigma_rad", 0.0001..=3.2).unwrap_or(0.03),
-        tag_family: keys.choice("tag_family", &TAG_FAMILIES).unwrap_or(Family::Tag36h11),
+        tag_family,
         tags,
         drift_m: drift_m.unwrap_or(0.02),
         drift_rad: drift_rad.unwrap_or(0.0175),
@@ -219,10 +230,10 @@ fn base(mut keys: Section<'_>) -> Base {
 }
 
 /// A tag with its number; `None` where something is wrong, which has been told.
-fn tag(id: &str, mut keys: Section<'_>) -> Option<(u32, PlacedTag)> {
-    let number = id.parse().ok().filter(|number: &u32| number.to_string() == id);
-    let id =
-        number.or_else(|| keys.wrong("id", &Value::from(id), "the number of a tag in its family, as the table's name"));
+fn tag(id: &str, family: Family, mut keys: Section<'_>) -> Option<(u32, PlacedTag)> {
+    let number = id.parse().ok().filter(|number: &u32| number.to_string() == id && *number < family.n_tags());
+    let allowed = format!("the number of a tag in its family, 0 to {}, as the table's name", family.n_tags() - 1);
+    let id = number.or_else(|| keys.wrong("id", &Value::from(id), &allowed));
     let size_m = keys.number("size_m", 0.001..=10.0);
     if size_m.is_none() {
         keys.missing("size_m", "the side of the tag's border, where black meets white, m");

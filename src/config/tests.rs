@@ -415,22 +415,33 @@ fn a_pinhole_with_coefficients_is_refused_and_one_with_zeros_is_not() {
 }
 
 #[test]
+fn tags_have_numbers_of_their_family() {
+    let numbered = |id: u32| parse(&RIG.replace("[base.tag.7]", &format!("[base.tag.{id}]")), &[]);
+    assert!(numbered(586).is_ok());
+    let refused = numbered(587).expect_err("tag36h11 ends before").to_string();
+    assert!(refused.contains("base.tag.587") && refused.contains("0 to 586"), "{refused}");
+}
+
+#[test]
 fn an_arm_on_can_buses_has_a_motor_for_each_joint() {
-    let rig = |joints: [&str; 2]| {
+    let text = |joints: [&str; 2]| {
         let [first, second] = joints;
-        let text = format!(
+        format!(
             "[arm]\ndriver = \"can\"\nurdf = \"two.urdf\"\nflange_link = \"c\"\n[arm.bus.can0]\n\
              [arm.motor.{first}]\nfamily = \"damiao\"\nbus = \"can0\"\nid = 2\nfeedback_id = 18\n\
              [arm.motor.{second}]\nfamily = \"odrive\"\nbus = \"can0\"\nid = 1\n\
              [camera.front]\ndriver = \"sim\"\nsize_px = [640, 480]\nrate_hz = 30\nparent = \"base\"\n\
              intrinsics = {{ focal_px = [600, 600], principal_px = [320, 240] }}\n"
-        );
-        parse(&text, &[Override::new("arm.joints", Value::from(vec!["j2", "j1"]))])
+        )
     };
+    let rig = |joints| parse(&text(joints), &[Override::new("arm.joints", Value::from(vec!["j2", "j1"]))]);
     let good = rig(["j1", "j2"]).expect("a motor for each joint");
     assert_eq!(good.arm.motors.iter().map(|motor| motor.joint.as_str()).collect::<Vec<_>>(), ["j2", "j1"]);
     let refused = rig(["j1", "j3"]).expect_err("no such joint").to_string();
     assert!(refused.contains("\"j3\" is none of the joints j2, j1"), "{refused}");
+    let same = parse(&text(["j1", "j2"]).replace("odrive\"", "damiao\"\nfeedback_id = 18"), &[]);
+    let refused = same.expect_err("both answer as 18").to_string();
+    assert!(refused.contains("\"j1\" and \"j2\" have the same number on \"can0\""), "{refused}");
     let refused = with("arm.driver", "'can'").expect_err("no motors for its joints").to_string();
     assert!(refused.contains("arm.motor"), "{refused}");
     let foreign = with("arm.motor.first.model", "'rs01'").expect_err("Damiao motors tell it themselves").to_string();

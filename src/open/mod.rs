@@ -25,6 +25,9 @@ use tags::WithTags;
 /// What helps where a device is not there.
 const WAY_OUT: &str = "--sim replaces every device by its simulated twin";
 
+/// The port of a Franka controller.
+pub(crate) const FCI_PORT: u16 = 1337;
+
 /// Which devices a rig file stands for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Devices {
@@ -147,7 +150,7 @@ fn check_lenses(rig: &Rig) -> anyhow::Result<()> {
 }
 
 /// Whether anything of a rig is simulated.
-fn is_any_simulated(rig: &Rig) -> bool {
+pub(crate) fn is_any_simulated(rig: &Rig) -> bool {
     rig.arm.driver == ArmDriver::Sim
         || rig.base.driver == BaseDriver::Sim
         || rig.cameras.iter().any(|camera| camera.driver == CameraDriver::Sim)

@@ -11,6 +11,8 @@ use std::collections::{BTreeMap, VecDeque};
 
 /// Sightings that wait for joint states; more are of a rig whose arm is silent, which is told elsewhere.
 const MAX_WAITING: usize = 64;
+/// So many images in which no pose fits the tags are no chance: one of the tags is not where the rig file has it.
+const SURELY_WRONG: u64 = 3;
 /// After so long without a pose a person is told why, seconds.
 const UNTIL_TOLD_SECS: f64 = 5.0;
 
@@ -160,7 +162,14 @@ impl WithTags {
         match why {
             Unlocated::NoTag => self.counts.n_without_tag += 1,
             Unlocated::Ambiguous => self.counts.n_ambiguous += 1,
-            Unlocated::FarOff { .. } => self.counts.n_far_off += 1,
+            Unlocated::FarOff { .. } => {
+                self.counts.n_far_off += 1;
+                if self.counts.n_far_off == SURELY_WRONG {
+                    log::warn!(
+                        "base: camera {camera:?}: {SURELY_WRONG} images fit no pose: {why}; what single tags told before may be wrong, too"
+                    );
+                }
+            }
         }
         let since = *self.told.get_or_insert(self.newest.unwrap_or(stamp));
         if stamp.secs_since(since) >= UNTIL_TOLD_SECS {

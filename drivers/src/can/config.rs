@@ -73,6 +73,20 @@ pub enum Family {
     },
 }
 
+impl Family {
+    /// Whether it could not be told from another one on the same bus.
+    pub fn clashes(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::Damiao { motor: a, feedback: b }, Self::Damiao { motor: c, feedback: d }) => a == c || b == d,
+            (Self::Robstride { motor: a, .. }, Self::Robstride { motor: b, .. })
+            | (Self::TMotor { motor: a, .. }, Self::TMotor { motor: b, .. }) => a == b,
+            (Self::Odrive { node: a }, Self::Odrive { node: b }) => a == b,
+            (Self::Cia402 { node: a, .. }, Self::Cia402 { node: b, .. }) => a == b,
+            _ => false,
+        }
+    }
+}
+
 /// A motor and its joint: `joint = direction * motor / gear_ratio + offset_rad`, the direction -1 where it is reversed.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MotorConfig {

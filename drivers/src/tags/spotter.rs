@@ -33,6 +33,19 @@ pub enum Family {
     Standard52h13,
 }
 
+impl Family {
+    /// How many tags it has; their numbers are below that.
+    pub fn n_tags(self) -> u32 {
+        match self {
+            Self::Tag36h11 => 587,
+            Self::Tag25h9 => 35,
+            Self::Tag16h5 => 30,
+            Self::Standard41h12 => 2115,
+            Self::Standard52h13 => 48_714,
+        }
+    }
+}
+
 /// A tag in an image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Spotted {

@@ -69,6 +69,16 @@ impl Order {
     }
 }
 
+/// What may be wrong with a stamp that cannot be.
+pub(crate) fn hint(head: &Head, arrival: Stamp) -> &'static str {
+    match head.clock {
+        Clock::Monotonic if Stamp(head.stamp_nanos) > arrival + MAX_AHEAD => {
+            ": \"monotonic\" is CLOCK_MONOTONIC of this computer; the time of day, or a clock elsewhere, is \"device\""
+        }
+        _ => "",
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -110,6 +120,10 @@ mod tests {
         for wrong in [now - 7, now - 8, now - 6 * SEC, now + SEC, i64::MAX, i64::MIN, 0] {
             assert_eq!(at(Clock::Monotonic, wrong, now), None, "{wrong}");
         }
+        let by_the_calendar = Head { seq: 0, clock: Clock::Monotonic, stamp_nanos: 1_790_000_000 * SEC };
+        assert!(hint(&by_the_calendar, Stamp(now)).contains("device"));
+        assert_eq!(hint(&Head { clock: Clock::Device, ..by_the_calendar }, Stamp(now)), "");
+        assert_eq!(hint(&Head { stamp_nanos: now - 7, ..by_the_calendar }, Stamp(now)), "");
         // A clock of its own, at any time.
         assert_eq!(at(Clock::Device, -5, now), Some(Stamp(now)));
         assert_eq!(at(Clock::Device, SEC - 5, now + SEC), Some(Stamp(now + SEC)));

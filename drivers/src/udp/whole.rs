@@ -1,7 +1,7 @@
 //! Readings of which each comes whole in one datagram.
 
 use super::counts::{Counts, tell};
-use super::order::{Order, Place};
+use super::order::{self, Order, Place};
 use super::receiver::{Arrived, Receiver};
 use crate::Error;
 use crate::wire::Malformed;
@@ -82,12 +82,9 @@ impl WholeReadings {
         let stamp = order.stamp(&head, arrived.at);
         if stamp.is_none() {
             let says = head.stamp_nanos;
-            tell(
-                device,
-                &mut counts.n_refused,
-                1,
-                format_args!("the stamp {says} is not after the last, or not of now"),
-            );
+            let hint = order::hint(&head, arrived.at);
+            let what = format_args!("the stamp {says} is not after the last, or not of now{hint}");
+            tell(device, &mut counts.n_refused, 1, what);
         }
         Some((stamp?, reading))
     }

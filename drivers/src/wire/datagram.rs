@@ -16,6 +16,8 @@ const FAR_M: f64 = 1e4;
 const MOST_RAD: f64 = 100.0;
 /// Most characters of a parser's message that are told.
 const MAX_TOLD: usize = 200;
+/// How far the halves of a covariance may be from each other, as a share of what they may be at most; single precision does less.
+const SAME_WITHIN: f64 = 1e-4;
 /// How far from one the length of a quaternion may be.
 const UNIT_WITHIN: f64 = 1e-3;
 
@@ -287,10 +289,19 @@ fn covariance(numbers: Vec<f64>) -> Result<Box<[f64; 36]>, Malformed> {
     let n = numbers.len();
     let covariance: Box<[f64; 36]> =
         numbers.try_into().map_err(|_| amiss(format!("covariance has {n} numbers, not 36")))?;
-    match (0..6).all(|ix| (0.0..=FAR_M).contains(&covariance[7 * ix])) {
-        true => Ok(covariance),
-        false => Err(amiss(format!("covariance has a variance outside 0 to {FAR_M}"))),
+    if !(0..6).all(|ix| (0.0..=FAR_M).contains(&covariance[7 * ix])) {
+        return Err(amiss(format!("covariance has a variance outside 0 to {FAR_M}")));
     }
+    for (row, column) in (0..6).flat_map(|row| (0..row).map(move |column| (row, column))) {
+        let [below, above] = [covariance[6 * row + column], covariance[6 * column + row]];
+        let most = (covariance[7 * row] * covariance[7 * column]).sqrt();
+        if (below - above).abs() > SAME_WITHIN * most || below.abs() > (1.0 + SAME_WITHIN) * most {
+            return Err(amiss(format!(
+                "covariance: row {row}, column {column} (from 0) is not as its mirror image, or larger than the variances allow"
+            )));
+        }
+    }
+    Ok(covariance)
 }
 
 /// Reads the state of joints of these names; a sender that names them must name the same in the same order.
@@ -398,7 +409,8 @@ mod tests {
     fn pose() -> PoseDatagram {
         let rotation = UnitQuaternion::from_euler_angles(0.1, -0.2, 3.0);
         let world_from_base = Transform::from_parts(Translation3::new(0.1, -1.0 / 3.0, 1e3), rotation);
-        let covariance = Some(Box::new(std::array::from_fn(|ix| 1e-4 * (1 + ix) as f64)));
+        let covariance =
+            Some(Box::new(std::array::from_fn(|ix| if ix % 7 == 0 { 1e-4 } else { 1e-6 * (ix / 6 + ix % 6) as f64 })));
         PoseDatagram { head: Head { clock: Clock::Device, ..HEAD }, world_from_base, covariance }
     }
 
@@ -479,6 +491,8 @@ mod tests {
             (r#""covariance":["#, r#""covariance":[1],"x":["#, "36"),
             (r#""covariance":["#, r#""covariance":[-1],"x":["#, "36"),
             (r#""covariance":[0.0001"#, r#""covariance":[-0.0001"#, "variance outside"),
+            (r#""covariance":[0.0001,1e-6"#, r#""covariance":[0.0001,2e-6"#, "row 1, column 0"),
+            (r#""covariance":[0.0001"#, r#""covariance":[0.0"#, "row 1, column 0"),
         ] {
             assert!(other.contains(from), "{from}");
             let told = decode_pose(other.replace(from, to).as_bytes()).expect_err(to).to_string();

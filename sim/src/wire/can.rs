@@ -107,8 +107,8 @@ fn play(bus: &Bus, mut shafts: Vec<Shaft>, track: &JointTrack, signs: &Signs) ->
                     Err(error) => log::debug!("joint {:?}: {error}", shaft.config.joint),
                 }
             }
-            if shaft.motor.state() != State::Free {
-                signs.is_moved.store(true, Ordering::Relaxed);
+            if shaft.motor.state() != State::Free && !signs.is_moved.swap(true, Ordering::Relaxed) {
+                log::info!("a client moves the arm: from now on it stays where clients want it");
             }
         }
     }

@@ -8,7 +8,9 @@ use drivers::franka::played::{Joints, PlayedRobot, RobotConfig};
 pub fn play_fci(track: JointTrack, config: RobotConfig) -> Result<PlayedRobot, Error> {
     let mut is_moved = false;
     let owner = move |now, wanted: &drivers::franka::played::Wanted| {
-        is_moved |= wanted.is_moving;
+        if wanted.is_moving && !std::mem::replace(&mut is_moved, true) {
+            log::info!("a client moves the arm: from now on it stays where clients want it");
+        }
         if is_moved {
             let (position_rad, velocity_rad_s) = (wanted.position_rad, wanted.velocity_rad_s);
             return Joints { position_rad, velocity_rad_s, ..Joints::default() };

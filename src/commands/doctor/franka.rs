@@ -1,12 +1,18 @@
 //! What a rig with a Franka arm needs of this computer and of the way to the robot; nothing here takes its one place for clients.
 
-use super::{Finding, field};
+use super::{Finding, Verdict, field};
 use crate::config::{ArmDriver, Rig};
+use crate::open::FCI_PORT;
+use std::io::ErrorKind;
+use std::net::{TcpStream, ToSocketAddrs};
 use std::path::Path;
 use std::process::Command;
+use std::time::Duration;
 
 /// Franka asks for less between a state and the answer to it.
 const MOST_MILLIS: f64 = 1.0;
+/// A controller in the same network answers at once.
+const LONGEST_CONNECTING: Duration = Duration::from_secs(1);
 /// Pings, five a second.
 const N_PINGS: &str = "10";
 
@@ -26,14 +32,34 @@ pub(super) fn franka(rig: Option<&Rig>) -> Vec<Finding> {
         Some(String::from_utf8_lossy(&output.stdout).into_owned())
     };
     findings.extend(ran("ip", &["-o", "route", "get", host]).map(|told| route(Path::new("/sys"), host, &told)));
-    findings.push(match ran("ping", &["-n", "-q", "-i", "0.2", "-W", "1", "-c", N_PINGS, host]) {
+    let pinged = match ran("ping", &["-n", "-q", "-i", "0.2", "-W", "1", "-c", N_PINGS, host]) {
         Some(told) => pings(host, &told),
         None => {
             let mend = "sudo apt-get install -y iputils-ping";
             Finding::warn("robot", format!("whether {host} answers is not known without ping"), mend)
         }
-    });
+    };
+    let is_there = pinged.verdict != Verdict::Fail;
+    findings.push(pinged);
+    findings.extend(is_there.then(|| port(&arm.address)));
     findings
+}
+
+/// Whether the controller takes clients: a connection is opened, and closed without a word, by which it gives away no place.
+fn port(address: &str) -> Finding {
+    let is_bare = host_of(address) == address;
+    let found = if is_bare { (address, FCI_PORT).to_socket_addrs() } else { address.to_socket_addrs() };
+    let connected = found.and_then(|mut all| {
+        let address = all.next().ok_or(ErrorKind::AddrNotAvailable)?;
+        TcpStream::connect_timeout(&address, LONGEST_CONNECTING)
+    });
+    match connected {
+        Ok(_) => Finding::ok("FCI", format!("{address} takes clients")),
+        Err(error) => {
+            let mend = "activate FCI in Desk; unlock the joints; FCI is a feature that the robot has to have";
+            Finding::fail("FCI", format!("{address} takes no client: {error}"), mend)
+        }
+    }
 }
 
 /// An address without its port; addresses of IPv6 with one stand in brackets.
@@ -118,7 +144,6 @@ fn pings(host: &str, told: &str) -> Finding {
 
 #[cfg(test)]
 mod tests {
-    use super::super::Verdict;
     use super::*;
 
     #[test]
@@ -132,6 +157,16 @@ mod tests {
         ] {
             assert_eq!(host_of(address), host);
         }
+    }
+
+    #[test]
+    fn whether_a_controller_takes_clients_is_told() {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
+        let address = listener.local_addr().expect("bound").to_string();
+        assert_eq!(port(&address).verdict, Verdict::Ok);
+        drop(listener);
+        let finding = port(&address);
+        assert!(finding.says.contains(&address) && finding.mend.is_some_and(|mend| mend.contains("Desk")));
     }
 
     #[test]

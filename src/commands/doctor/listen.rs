@@ -25,12 +25,20 @@ pub(super) struct Delivered {
     wanted_hz: Option<f64>,
     /// Images that the device or the driver lost.
     lost: u64,
-    /// From mid-exposure, or from the stamp of a state, to when it can be used here; half of all, 99 of 100, and all take no longer.
+    /// Of devices that are not simulated.
+    #[serde(flatten)]
+    latency: Option<Latency>,
+    /// 99 of 100 follow within this on the one before.
+    gap_p99_millis: f64,
+}
+
+/// From mid-exposure, or from the stamp of a state, to when it can be used here.
+#[derive(Debug, PartialEq, Serialize)]
+struct Latency {
+    /// Half of all, 99 of 100, and all take no longer.
     latency_p50_millis: f64,
     latency_p99_millis: f64,
     latency_max_millis: f64,
-    /// 99 of 100 follow within this on the one before.
-    gap_p99_millis: f64,
 }
 
 /// The whole of what was heard.
@@ -54,7 +62,7 @@ impl Track {
         self.latency_millis.push(now.secs_since(stamp) * 1e3);
     }
 
-    fn told(mut self, device: String, wanted_hz: Option<f64>) -> Delivered {
+    fn told(mut self, device: String, wanted_hz: Option<f64>, is_simulated: bool) -> Delivered {
         let mut gaps: Vec<f64> = self.stamps.windows(2).map(|pair| pair[1].secs_since(pair[0]) * 1e3).collect();
         gaps.sort_by(f64::total_cmp);
         self.latency_millis.sort_by(f64::total_cmp);
@@ -70,9 +78,11 @@ impl Track {
             rate_hz: if spanned > 0.0 { n_gaps as f64 / spanned } else { 0.0 },
             wanted_hz,
             lost: self.lost,
-            latency_p50_millis: share(&self.latency_millis, 0.5),
-            latency_p99_millis: share(&self.latency_millis, 0.99),
-            latency_max_millis: share(&self.latency_millis, 1.0),
+            latency: (!is_simulated).then(|| Latency {
+                latency_p50_millis: share(&self.latency_millis, 0.5),
+                latency_p99_millis: share(&self.latency_millis, 0.99),
+                latency_max_millis: share(&self.latency_millis, 1.0),
+            }),
             gap_p99_millis: share(&gaps, 0.99),
         }
     }
@@ -116,13 +126,15 @@ pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Heard>
     if let (Some(cpu_began), Some(cpu)) = (cpu_began, clock::processor()) {
         findings.push(Finding::ok("processor", cpu_told(cpu - cpu_began, began.elapsed())));
     }
+    // A simulation has a clock of its own.
+    let is_simulated = open::is_any_simulated(&rig);
     let wanted = wanted(&rig);
     findings.extend(missing(&rig, &wanted, &tracks));
     let devices: Vec<_> = tracks
         .into_iter()
         .map(|(device, track)| {
             let wanted_hz = wanted.get(&device).copied().flatten();
-            track.told(device, wanted_hz)
+            track.told(device, wanted_hz, is_simulated)
         })
         .collect();
     findings.extend(devices.iter().filter_map(complaint));
@@ -188,15 +200,12 @@ fn complaint(delivered: &Delivered) -> Option<Finding> {
 
 impl std::fmt::Display for Delivered {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self {
-            device, samples, rate_hz, latency_p50_millis: half, latency_p99_millis: most, gap_p99_millis, ..
-        } = self;
-        write!(
-            f,
-            "{device}: {samples}, {rate_hz:.1} a second, {half:.1} ms old (99 %: {most:.1}) when they are here, \
-             at most {gap_p99_millis:.1} ms apart (99 %), {} lost",
-            self.lost
-        )
+        let Self { device, samples, rate_hz, latency, gap_p99_millis, lost, .. } = self;
+        write!(f, "{device}: {samples}, {rate_hz:.1} a second, ")?;
+        if let Some(Latency { latency_p50_millis: half, latency_p99_millis: most, .. }) = latency {
+            write!(f, "{half:.1} ms old (99 %: {most:.1}) when they are here, ")?;
+        }
+        write!(f, "at most {gap_p99_millis:.1} ms apart (99 %), {lost} lost")
     }
 }
 
@@ -221,17 +230,19 @@ mod tests {
 
     #[test]
     fn rates_latencies_and_losses_are_told_and_complained_of() {
-        let told = track(301, 100, 0).told("camera \"wrist\"".into(), Some(10.0));
+        let told = track(301, 100, 0).told("camera \"wrist\"".into(), Some(10.0), false);
         assert!((told.rate_hz - 10.0).abs() < 1e-9);
-        assert!((told.latency_p50_millis - 10.0).abs() < 1e-6 && (told.latency_p99_millis - 10.0).abs() < 1e-6);
-        assert!((told.latency_max_millis - 500.0).abs() < 1e-6);
+        let latency = told.latency.as_ref().expect("it is no simulation");
+        assert!((latency.latency_p50_millis - 10.0).abs() < 1e-6 && (latency.latency_p99_millis - 10.0).abs() < 1e-6);
+        assert!((latency.latency_max_millis - 500.0).abs() < 1e-6);
         assert_eq!(complaint(&told), None);
         assert!(told.to_string().contains("301, 10.0 a second, 10.0 ms old"), "{told}");
-        let slow = track(301, 100, 0).told("camera \"wrist\"".into(), Some(15.0));
+        let slow = track(301, 100, 0).told("camera \"wrist\"".into(), Some(15.0), false);
         assert!(complaint(&slow).is_some_and(|finding| finding.says.contains("the rig file says 15.0")));
-        let lossy = track(301, 100, 4).told("camera \"wrist\"".into(), Some(10.0));
+        let lossy = track(301, 100, 4).told("camera \"wrist\"".into(), Some(10.0), false);
         assert!(complaint(&lossy).is_some_and(|finding| finding.says.contains("lost 4 images")));
-        let nothing = Track::default().told("arm".into(), None);
-        assert_eq!((nothing.rate_hz, nothing.latency_p99_millis), (0.0, 0.0));
+        let nothing = Track::default().told("arm".into(), None, true);
+        assert_eq!((nothing.rate_hz, &nothing.latency), (0.0, &None));
+        assert!(!nothing.to_string().contains("old"), "{nothing}");
     }
 }

@@ -4,7 +4,7 @@ use super::Args;
 use super::bag::Films;
 use crate::config::{ArmDriver, BaseDriver, Rig, ScannerDriver};
 use crate::exit::{BadArgument, Exit};
-use crate::open::{self, Devices, Opened};
+use crate::open::{self, Devices, FCI_PORT, Opened};
 use crate::print;
 use crate::stop::Stop;
 use anyhow::{Context, bail};
@@ -18,8 +18,6 @@ use std::net::{SocketAddr, ToSocketAddrs};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// The port of FCI.
-const FCI_PORT: u16 = 1337;
 /// What is simulated, beside the rig file.
 const SCRIPT_FILE: &str = "script.mcap";
 /// How soon Ctrl-C is noticed.
@@ -149,7 +147,7 @@ fn simulate(args: &Args, rig: &Rig, folder: &Path, stop: &Stop) -> anyhow::Resul
 
 /// What the devices of a recording say in its first seconds; images go to the cameras' files. `None` where that was interrupted.
 fn read(recording: &Path, args: &Args, films: &mut Films, stop: &Stop) -> anyhow::Result<Option<Script>> {
-    let mut source = open::recording(recording, None, &[])?.source;
+    let Opened { mut source, damage, .. } = open::recording(recording, None, &[])?;
     let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
     let mut script = Script::default();
     let mut first: Option<Stamp> = None;
@@ -168,6 +166,9 @@ fn read(recording: &Path, args: &Args, films: &mut Films, stop: &Stop) -> anyhow
         }
     }
     bar.finish_and_clear();
+    if let Some(damage) = damage.get() {
+        log::warn!("{damage}; what came before is played");
+    }
     Ok(Some(script))
 }
 
