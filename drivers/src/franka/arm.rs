@@ -242,6 +242,8 @@ impl Line {
     fn read(&mut self, session: &Session, shared: &Shared) -> Result<(), String> {
         let network = &session.network;
         let mut buffer = [0; MAX_STATE_BYTES];
+        // What waited meanwhile arrives at once, and says nothing on the robot's clock.
+        while let Ok(Some(_)) = network.udp.try_receive(&mut buffer) {}
         let mut heard = clock::now();
         loop {
             let mut received = network.udp.blocking_receive(&mut buffer).ok();
