@@ -8,11 +8,18 @@ use std::ops::Range;
 /// What no square covers: larger than every count less one.
 pub(super) const NOTHING: u16 = u16::MAX;
 /// Strips: squares one, two, three and four columns wide. Wider ones are rare, and are put where they are column by column.
-const N_STRIPS: usize = 4;
+const MOST_STRIPS: usize = 4;
 /// Room before the first column of a strip.
-const PAD: usize = N_STRIPS;
+const PAD: usize = MOST_STRIPS;
+/// Places in the strips, as many as 16 bits count: none needs to be checked.
+const N_PLACES: usize = 1 << 16;
+/// Places behind the strips for what is nowhere, one after the other: were it the same for all, each would have to wait for the one
+/// before.
+const N_NOWHERE: usize = 256;
 /// Place of a square that is too wide for the strips.
-const WIDE: u32 = u32::MAX;
+const WIDE: u16 = u16::MAX;
+/// Columns beyond these are not covered: they have no place in a strip.
+pub(super) const MOST_COLUMNS: u16 = (N_PLACES - 1 - N_NOWHERE - PAD - 1) as u16;
 /// Pixels that are looked at at once.
 const BLOCK: usize = 32;
 
@@ -28,27 +35,33 @@ pub(super) struct Canvas {
     width: usize,
     /// The nearest count less one of each pixel: `[height, width]`.
     nearest: Vec<u16>,
-    /// The nearest of the squares of so many columns that begin at a column, of the run of the moment: [`N_STRIPS`] times `stride`,
-    /// and a place for each pixel of depth that is nowhere: were it the same for all, each would have to wait for the one before.
-    strips: Vec<u16>,
+    /// The nearest of the squares of so many columns that begin at a column, of the run of the moment: `n_strips` times `stride`,
+    /// and [`N_NOWHERE`].
+    strips: Box<[u16; N_PLACES]>,
+    /// As many as there is room for.
+    n_strips: usize,
     stride: usize,
     /// Of each pixel of the row: first line in the upper half, last line in the lower; 0 where it covers nothing.
     lines: Vec<u32>,
     /// Of each pixel of the row: where in the strips it is put.
-    places: Vec<u32>,
+    places: Vec<u16>,
+    /// Of each pixel of the row: its count less one.
+    less_one: Vec<u16>,
 }
 
 impl Canvas {
     /// Of nothing, for rows of `depth_width` pixels.
     pub(super) fn new([width, height]: [usize; 2], depth_width: usize) -> Self {
-        let stride = width + 1 + PAD;
+        let stride = width.min(usize::from(MOST_COLUMNS)) + 1 + PAD;
         Self {
             width,
             nearest: vec![NOTHING; width * height],
-            strips: vec![NOTHING; N_STRIPS * stride + depth_width],
+            strips: Box::new([NOTHING; N_PLACES]),
+            n_strips: MOST_STRIPS.min((N_PLACES - 1 - N_NOWHERE) / stride),
             stride,
             lines: vec![0; depth_width],
             places: vec![0; depth_width],
+            less_one: vec![0; depth_width],
         }
     }
 
@@ -61,63 +74,79 @@ impl Canvas {
     #[inline(always)]
     pub(super) fn put(&mut self, row: &[u16], covered: &Covered) {
         self.place(row, covered);
-        let (mut begin, mut run) = (0, 0);
-        for block in (0..row.len()).step_by(BLOCK) {
-            let end = (block + BLOCK).min(row.len());
-            let lines = &self.lines[block..end];
-            // Without branches: numbers that are 0 where all is well.
-            let others = lines.iter().fold(0, |so_far, lines| so_far | if *lines == 0 { 0 } else { lines ^ run });
-            let wide = self.places[block..end].iter().fold(0, |so_far, place| so_far | u32::from(*place == WIDE));
-            if others | wide == 0 {
-                let strips = &mut self.strips[..];
-                for (place, count) in self.places[block..end].iter().zip(&row[block..end]) {
-                    let nearest = &mut strips[*place as usize];
-                    *nearest = count.wrapping_sub(1).min(*nearest);
-                }
-                continue;
-            }
-            for (ix, count) in (block..end).zip(&row[block..end]) {
-                let lines = self.lines[ix];
-                if lines == 0 {
-                    continue;
-                }
-                if lines != run {
-                    self.flush(begin..ix, run, covered);
-                    (begin, run) = (ix, lines);
-                }
-                let columns = match self.places[ix] {
-                    WIDE => usize::from(covered.first[0][ix]) + PAD..usize::from(covered.last[0][ix]) + PAD + 1,
-                    place => place as usize..place as usize + 1,
-                };
-                let less_one = count - 1;
-                self.strips[columns].iter_mut().for_each(|nearest| *nearest = less_one.min(*nearest));
-            }
+        let mut begin = 0;
+        while let Some(run) = self.run_from(begin) {
+            self.fill(run.clone(), covered);
+            self.flush(run.clone(), covered);
+            begin = run.end;
         }
-        self.flush(begin..row.len(), run, covered);
+    }
+
+    /// The next pixels that cover the same lines, from the first that covers any; those between that cover nothing are no end.
+    #[inline(always)]
+    fn run_from(&self, begin: usize) -> Option<Range<usize>> {
+        let first = begin + self.lines[begin..].iter().position(|lines| *lines != 0)?;
+        let run = self.lines[first];
+        let is_other = |lines: &u32| (*lines != 0) & (*lines != run);
+        let mut end = first;
+        for block in self.lines[first..].chunks(BLOCK) {
+            // All at once, then the first one.
+            if block.iter().fold(false, |so_far, lines| so_far | is_other(lines)) {
+                end += block.iter().take_while(|lines| !is_other(lines)).count();
+                break;
+            }
+            end += block.len();
+        }
+        Some(first..end)
+    }
+
+    /// Puts a run of pixels into the strips.
+    #[inline(always)]
+    fn fill(&mut self, run: Range<usize>, covered: &Covered) {
+        let (places, less_one) = (&self.places[run.clone()], &self.less_one[run.clone()]);
+        let has_wide = places.iter().fold(false, |so_far, place| so_far | (*place == WIDE));
+        if !has_wide {
+            for (place, less_one) in places.iter().zip(less_one) {
+                let nearest = &mut self.strips[usize::from(*place)];
+                *nearest = (*less_one).min(*nearest);
+            }
+            return;
+        }
+        for (ix, (place, less_one)) in run.zip(places.iter().zip(less_one)) {
+            let columns = match *place {
+                WIDE => usize::from(covered.first[0][ix]) + PAD..usize::from(covered.last[0][ix]) + PAD + 1,
+                place => usize::from(place)..usize::from(place) + 1,
+            };
+            self.strips[columns].iter_mut().for_each(|nearest| *nearest = (*less_one).min(*nearest));
+        }
     }
 
     /// Where each pixel of a row is to be put.
-    #[expect(clippy::cast_possible_truncation, reason = "widths of images have 16 bits")]
+    #[expect(clippy::cast_possible_truncation, reason = "places have 16 bits")]
     #[inline(always)]
     fn place(&mut self, row: &[u16], covered: &Covered) {
         let n = row.len();
         let Covered { first: [left, top], last: [right, bottom] } = covered;
         let (left, top, right, bottom) = (&left[..n], &top[..n], &right[..n], &bottom[..n]);
         let (lines, places) = (&mut self.lines[..n], &mut self.places[..n]);
-        let stride = self.stride as u32;
+        let less_one = &mut self.less_one[..n];
+        let (stride, n_strips) = (self.stride as u16, self.n_strips as u16);
+        let nowhere = n_strips * stride;
         for ix in 0..n {
             let is_seen = (row[ix] != 0) & (left[ix] <= right[ix]) & (top[ix] <= bottom[ix]);
-            let n_more = u32::from(right[ix].wrapping_sub(left[ix]));
-            let place = n_more.wrapping_mul(stride).wrapping_add(u32::from(left[ix]) + PAD as u32);
-            let place = if n_more < N_STRIPS as u32 { place } else { WIDE };
+            let n_more = right[ix].wrapping_sub(left[ix]);
+            let place = n_more.wrapping_mul(stride).wrapping_add(left[ix]).wrapping_add(PAD as u16);
+            let place = if n_more < n_strips { place } else { WIDE };
             lines[ix] = if is_seen { u32::from(top[ix]) << 16 | u32::from(bottom[ix]) } else { 0 };
-            places[ix] = if is_seen { place } else { N_STRIPS as u32 * stride + ix as u32 };
+            places[ix] = if is_seen { place } else { nowhere + (ix % N_NOWHERE) as u16 };
+            less_one[ix] = row[ix].wrapping_sub(1);
         }
     }
 
     /// Puts a run of pixels into the lines that they cover, and empties the strips.
     #[inline(always)]
-    fn flush(&mut self, run: Range<usize>, lines: u32, covered: &Covered) {
+    fn flush(&mut self, run: Range<usize>, covered: &Covered) {
+        let lines = self.lines[run.start];
         let seen = self.lines[run.clone()].iter();
         let columns = covered.first[0][run.clone()].iter().zip(&covered.last[0][run]);
         let (from, to) = seen.zip(columns).fold((u16::MAX, 0), |(from, to), (lines, (left, right))| {
@@ -128,14 +157,10 @@ impl Canvas {
             return;
         }
         let (from, n) = (usize::from(from), usize::from(to - from) + 1);
-        for n_more in (1..N_STRIPS).rev() {
+        for n_more in (1..self.n_strips).rev() {
             // A square of so many columns is two of one column less.
             let (narrower, strip) = self.strips[(n_more - 1) * self.stride..].split_at_mut(self.stride);
-            let narrower = &mut narrower[PAD + from..][..n];
-            let two = strip[PAD + from..][..n].iter().zip(&strip[PAD + from - 1..][..n]);
-            for (nearest, (here, before)) in narrower.iter_mut().zip(two) {
-                *nearest = (*nearest).min(*here).min(*before);
-            }
+            merge(&mut narrower[PAD + from..][..n], &strip[PAD + from..][..n], &strip[PAD + from - 1..][..n]);
             strip[PAD + from..][..n].fill(NOTHING);
         }
         let columns = &mut self.strips[PAD + from..][..n];
@@ -144,5 +169,15 @@ impl Canvas {
             line.iter_mut().zip(&*columns).for_each(|(nearest, new)| *nearest = (*new).min(*nearest));
         }
         columns.fill(NOTHING);
+    }
+}
+
+/// The nearest of three; each list an argument of its own, so that the compiler makes vector code of it.
+#[inline(always)]
+fn merge(nearest: &mut [u16], here: &[u16], before: &[u16]) {
+    let n = nearest.len();
+    let (here, before) = (&here[..n], &before[..n]);
+    for ix in 0..n {
+        nearest[ix] = nearest[ix].min(here[ix]).min(before[ix]);
     }
 }

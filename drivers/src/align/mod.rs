@@ -9,7 +9,7 @@
 mod cover;
 
 use crate::{Error, Image, PixelFormat};
-use cover::{Canvas, Covered};
+use cover::{Canvas, Covered, MOST_COLUMNS};
 use kinematics::{Intrinsics, Lens, Transform};
 use std::sync::Arc;
 
@@ -230,22 +230,24 @@ fn project_by(
 #[expect(clippy::cast_possible_truncation, reason = "the low 16 bits are the number")]
 #[inline(always)]
 fn number(numbers: &mut [u16], positions_px: &[f32], side: u32, corner: Corner) {
-    // Numbers have 16 bits: larger images get no depth beyond.
-    let side = side.min(u32::from(u16::MAX) - 1) as f32;
+    // Larger images get no depth beyond.
+    let side = side.min(u32::from(MOST_COLUMNS)) as f32;
     let (least, most) = match corner {
         Corner::First => (1.0, side + 1.0),
         Corner::Last => (0.0, side),
     };
     // From here on floats have no fractions, and their low bits count.
     const WHOLE: f32 = 8_388_608.0;
-    for (number, position_px) in numbers.iter_mut().zip(positions_px) {
+    let n = positions_px.len();
+    let (numbers, positions_px) = (&mut numbers[..n], &positions_px[..n]);
+    for ix in 0..n {
         // Comparisons as vector instructions make them, which `max` and `min` are not for what is no number.
-        let from_one = position_px + 1.0;
+        let from_one = positions_px[ix] + 1.0;
         let from_one = if from_one > least { from_one } else { least };
         let from_one = if from_one < most { from_one } else { most };
         let nearest = (from_one + WHOLE) - WHOLE;
         let below = nearest - if nearest > from_one { 1.0 } else { 0.0 };
-        *number = (below + WHOLE).to_bits() as u16;
+        numbers[ix] = (below + WHOLE).to_bits() as u16;
     }
 }
 
