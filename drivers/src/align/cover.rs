@@ -19,7 +19,7 @@ const N_NOWHERE: usize = 256;
 /// Place of a square that is too wide for the strips.
 const WIDE: u16 = u16::MAX;
 /// Columns beyond these are not covered: they have no place in a strip.
-pub(super) const MOST_COLUMNS: u16 = (N_PLACES - 1 - N_NOWHERE - PAD - 1) as u16;
+pub(super) const MOST_COLUMNS: usize = N_PLACES - 1 - N_NOWHERE - PAD - 1;
 /// Pixels that are looked at at once.
 const BLOCK: usize = 32;
 
@@ -52,7 +52,7 @@ pub(super) struct Canvas {
 impl Canvas {
     /// Of nothing, for rows of `depth_width` pixels.
     pub(super) fn new([width, height]: [usize; 2], depth_width: usize) -> Self {
-        let stride = width.min(usize::from(MOST_COLUMNS)) + 1 + PAD;
+        let stride = width.min(MOST_COLUMNS) + 1 + PAD;
         Self {
             width,
             nearest: vec![NOTHING; width * height],
@@ -85,19 +85,11 @@ impl Canvas {
     /// The next pixels that cover the same lines, from the first that covers any; those between that cover nothing are no end.
     #[inline(always)]
     fn run_from(&self, begin: usize) -> Option<Range<usize>> {
-        let first = begin + self.lines[begin..].iter().position(|lines| *lines != 0)?;
-        let run = self.lines[first];
-        let is_other = |lines: &u32| (*lines != 0) & (*lines != run);
-        let mut end = first;
-        for block in self.lines[first..].chunks(BLOCK) {
-            // All at once, then the first one.
-            if block.iter().fold(false, |so_far, lines| so_far | is_other(lines)) {
-                end += block.iter().take_while(|lines| !is_other(lines)).count();
-                break;
-            }
-            end += block.len();
-        }
-        Some(first..end)
+        let lines = &self.lines[begin..];
+        let first = place_of(lines, |lines| lines != 0)?;
+        let run = lines[first];
+        let n = place_of(&lines[first..], |lines| (lines != 0) & (lines != run)).unwrap_or(lines.len() - first);
+        Some(begin + first..begin + first + n)
     }
 
     /// Puts a run of pixels into the strips.
@@ -170,6 +162,14 @@ impl Canvas {
         }
         columns.fill(NOTHING);
     }
+}
+
+/// The first number that is so: all of a block are looked at at once.
+#[inline(always)]
+fn place_of(numbers: &[u32], is_so: impl Fn(u32) -> bool) -> Option<usize> {
+    let has_one = |block: &&[u32]| block.iter().fold(false, |so_far, number| so_far | is_so(*number));
+    let (block_ix, block) = numbers.chunks(BLOCK).enumerate().find(|(_, block)| has_one(block))?;
+    Some(BLOCK * block_ix + block.iter().position(|number| is_so(*number))?)
 }
 
 /// The nearest of three; each list an argument of its own, so that the compiler makes vector code of it.

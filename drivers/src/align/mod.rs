@@ -231,7 +231,7 @@ fn project_by(
 #[inline(always)]
 fn number(numbers: &mut [u16], positions_px: &[f32], side: u32, corner: Corner) {
     // Larger images get no depth beyond.
-    let side = side.min(u32::from(MOST_COLUMNS)) as f32;
+    let side = (side as usize).min(MOST_COLUMNS) as f32;
     let (least, most) = match corner {
         Corner::First => (1.0, side + 1.0),
         Corner::Last => (0.0, side),
