@@ -419,6 +419,23 @@ mod tests {
     }
 
     #[test]
+    fn images_too_wide_for_all_strips_are_those_of_the_twin() {
+        for width in [20_000, 40_000] {
+            let camera = |focal_px| camera([width, 5], focal_px, Lens::Pinhole);
+            let (depth, color) = (camera(12_000.0), camera(20_000.0));
+            let moved = Transform::translation(0.0148, 0.0, 0.0);
+            let scene = scene(depth.size_px);
+            let alignment = DepthAlignment::new(&depth, &color, &moved);
+            let got = counts(&alignment.align(&image(depth.size_px, &scene)).expect("depth"));
+            let wanted = twin(&depth, &color, &moved, &scene);
+            // So far from the middle f32 knows a corner to some thousandths of a pixel.
+            let equal = equal_frac(&got, &wanted);
+            assert!(equal >= 0.99, "{width}: {equal}");
+            assert!(wanted.iter().filter(|count| **count > 0).count() > wanted.len() / 2, "the scene is not seen");
+        }
+    }
+
+    #[test]
     fn a_wall_moves_by_baseline_over_depth_and_a_box_hides_it() {
         // 400 px * 51.25 mm / 1 m is 20.5 px to the right; no corner lies on an edge of a pixel's column.
         let camera =
