@@ -285,6 +285,30 @@ fn a_file_by_the_clock_begins_when_its_stamps_say_so() {
 }
 
 #[test]
+fn a_file_that_is_opened_late_begins_where_its_clock_is_and_has_lost_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, camera) = (folder.path().join("camera.bag"), d435i([640, 480], Lens::Pinhole));
+    let n_before = 30;
+    let mut writer = BagWriter::create(&path, &camera).unwrap();
+    (0..3 * n_before).for_each(|number| writer.write(&image(&camera, number)).unwrap());
+    writer.finish().unwrap();
+    let begins = drivers::clock::now() - Duration::from_nanos((n_before * PERIOD_NANOS).unsigned_abs());
+    let by_clock = Config { depth_size_px: None, ..config(path, &camera, Pace::Clock) };
+    let open = RealsenseCamera::open(Config { clock_offset_nanos: begins.0 - BEGIN_NANOS, ..by_clock }).unwrap();
+    let mut live = Live::new(Devices { cameras: vec![Box::new(open)], ..Devices::default() }).unwrap();
+    let mut images = Vec::new();
+    while let Some(Sample::Image(image)) = live.next_sample().unwrap() {
+        images.push(image);
+    }
+    let first = (images[0].stamp.0 - begins.0) / PERIOD_NANOS;
+    assert!((n_before..2 * n_before).contains(&first), "{first}");
+    for (ix, image) in (first..).zip(&images) {
+        assert_eq!((image.stamp.0, image.n_skipped), (begins.0 + ix * PERIOD_NANOS, 0));
+    }
+    assert_eq!(first + i64::try_from(images.len()).unwrap(), 3 * n_before);
+}
+
+#[test]
 fn a_file_that_nobody_reads_to_its_end_is_let_go() {
     let folder = tempfile::tempdir().expect("a folder");
     let (path, camera) = (folder.path().join("long.bag"), d435i([640, 480], Lens::Pinhole));

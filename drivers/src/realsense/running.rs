@@ -39,6 +39,8 @@ pub(super) struct Running {
     began: Instant,
     last_image: Instant,
     n_images: u64,
+    /// Of a file: due before it was opened.
+    n_past: u64,
     described: String,
     started: Started,
     device: Device,
@@ -95,6 +97,7 @@ impl Running {
             began: Instant::now(),
             last_image: Instant::now(),
             n_images: 0,
+            n_past: 0,
             described,
             started,
             device,
@@ -147,14 +150,29 @@ impl Running {
                     }
                     self.early = image;
                 }
-                None if has_stopped && (self.n_images > 0 || self.began.elapsed() > MAX_BEGIN) => return Ok(Next::End),
+                None if has_stopped && (self.n_images > 0 || self.began.elapsed() > MAX_BEGIN) => {
+                    self.tell_past("all of the");
+                    return Ok(Next::End);
+                }
                 None if left <= POLL => return Ok(Next::Nothing),
                 None => {}
             }
         }
     }
 
+    /// Says once how many images of a file came too early for us.
+    fn tell_past(&mut self, which: &str) {
+        let n_past = std::mem::take(&mut self.n_past);
+        if n_past > 0 {
+            log::warn!(
+                "camera {:?}: {which} images of its file, {n_past}, were due before it was opened: they are passed over",
+                self.camera
+            );
+        }
+    }
+
     fn give(&mut self, image: Image) -> Image {
+        self.tell_past("the first");
         self.last_image = Instant::now();
         self.n_images += 1;
         image
@@ -192,6 +210,10 @@ impl Running {
             exposure_secs,
             n_skipped: std::mem::take(&mut counted.n_untold),
         };
+        if self.stamps.is_of_before(image.stamp) {
+            self.n_past += 1;
+            return Ok(None);
+        }
         let image = if is_depth && !self.filters.are_none() {
             filled(image, &self.filters.pass(frame)?)
         } else {

@@ -41,6 +41,7 @@ pub(super) struct Stamps {
     /// Set for a file.
     pace: Option<Pace>,
     offset_nanos: i64,
+    opened: Stamp,
     micros: WrappingMicros,
     map: ClockMap,
     /// First time of a file, nanoseconds of the file, and when it came.
@@ -54,6 +55,7 @@ impl Stamps {
             camera: config.name.clone(),
             pace: config.file.is_some().then_some(config.pace),
             offset_nanos: config.clock_offset_nanos,
+            opened: clock::now(),
             micros: WrappingMicros::new(),
             map: ClockMap::new(),
             first: None,
@@ -82,6 +84,11 @@ impl Stamps {
     /// When an image is to be given out.
     pub(super) fn is_due(&self, stamp: Stamp) -> bool {
         matches!(self.pace, None | Some(Pace::Fast)) || stamp <= clock::now()
+    }
+
+    /// Whether an image was due before the file was opened: nobody waited for it, and it is none that is late.
+    pub(super) fn is_of_before(&self, stamp: Stamp) -> bool {
+        self.pace == Some(Pace::Clock) && stamp < self.opened
     }
 
     /// Time of the camera's clock, nanoseconds since it began; `None`, told once, where it does not tell.
