@@ -431,8 +431,11 @@ impl Moving {
     /// Motors without a watchdog would go on for ever where they did not hear the last words: they are told again, once a cycle, for as
     /// long as the others take to notice that nothing comes any more, and until they say something.
     fn insist(&mut self, now: Stamp) {
-        let (Some(ready), Phase::Stopped { since, told, .. }) = (&self.ready, &mut self.phase) else { return };
-        let Some(words) = *told else { return };
+        let Phase::Stopped { since, told, .. } = &mut self.phase else { return };
+        let (Some(ready), Some(words)) = (&self.ready, *told) else {
+            *told = None;
+            return;
+        };
         let is_deaf = |mover: &Mover| !self.plan.has_watchdog(&mover.config().family);
         ready.leave(words, is_deaf);
         let enough = *since + self.plan.timeout;
