@@ -83,4 +83,9 @@ pub trait RangeScanner: Send {
 pub trait Source: Send {
     /// The next sample, in stamp order as far as the devices allow; `None` at the end.
     fn next_sample(&mut self) -> Result<Option<Sample>, Error>;
+
+    /// Joint states, base poses and range scans that came and gave way to newer ones, so far, because the caller was slow.
+    fn n_others_dropped(&self) -> u64 {
+        0
+    }
 }

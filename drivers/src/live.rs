@@ -33,7 +33,7 @@ pub struct Devices {
 /// All devices of a rig, read by a thread each.
 ///
 /// A slow caller loses the oldest samples of a device: images are counted in [`Image::n_skipped`] of the next image of the
-/// same kind, everything else in [`Live::n_others_dropped`]; a camera that waits for its caller is made to wait. The first error of
+/// same kind, everything else in [`Source::n_others_dropped`]; a camera that waits for its caller is made to wait. The first error of
 /// a device is returned once by [`Source::next_sample`] and ends the source. So does the end of the last camera, where cameras are
 /// played from files: what was read until then still comes. Dropping it stops the threads.
 #[derive(Debug)]
@@ -129,11 +129,6 @@ impl Live {
     ) -> Result<(), Error> {
         let device_ix = self.threads.len();
         self.spawn(device, move |shared| read_until_stopped(shared, device_ix, room, read, silent))
-    }
-
-    /// Joint readings, base poses and range scans lost so far because the caller was slow.
-    pub fn n_others_dropped(&self) -> u64 {
-        self.shared.lock().n_others_dropped
     }
 
     fn spawn(&mut self, device: String, read: impl FnOnce(&Shared) + Send + 'static) -> Result<(), Error> {
@@ -279,6 +274,10 @@ impl Source for Live {
             }
             state = self.shared.arrived.wait(state).unwrap_or_else(PoisonError::into_inner);
         }
+    }
+
+    fn n_others_dropped(&self) -> u64 {
+        self.shared.lock().n_others_dropped
     }
 }
 

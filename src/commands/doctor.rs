@@ -4,8 +4,9 @@ mod franka;
 mod listen;
 
 use super::within;
-use crate::config::{BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
+use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
 use crate::exit::Exit;
+use crate::open;
 use crate::print;
 use crate::stop::Stop;
 #[cfg(target_os = "linux")]
@@ -81,10 +82,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     findings.push(cameras(Path::new("/dev")));
     #[cfg(target_os = "linux")]
     findings.extend(v4l2::cameras().into_iter().flatten().filter_map(|camera| usb(&camera)));
+    #[cfg(target_os = "linux")]
+    findings.extend(rig.iter().flat_map(missing_v4l2));
     findings.extend(realsense(rig.as_ref()));
     findings.extend(can(rig.as_ref()));
     findings.extend(franka::franka(rig.as_ref()));
     findings.push(port(USUAL_ADDRESS));
+    findings.extend(rig.iter().filter_map(motion));
     findings.extend(rig.iter().flat_map(|rig| senders(rig).into_iter().chain(files(rig))));
     tell(&findings, args.json)?;
     if let (Some(rig), Some(secs)) = (&rig, args.listen) {
@@ -287,6 +291,22 @@ fn usb(camera: &v4l2::Found) -> Option<Finding> {
     Some(Finding::warn("usb", says, mend))
 }
 
+/// V4L2 cameras of a rig that are not plugged in.
+#[cfg(target_os = "linux")]
+fn missing_v4l2(rig: &Rig) -> Vec<Finding> {
+    let of_camera = |camera: &Camera| {
+        let depth = camera.depth.as_ref().map(|depth| depth.device.clone());
+        [Some(camera.device.clone()), depth].into_iter().flatten().map(|device| (camera.name.clone(), device)).collect()
+    };
+    let cameras = rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::V4l2);
+    let devices = cameras.flat_map(|camera| -> Vec<_> { of_camera(camera) });
+    let missing = devices.filter_map(|(name, device)| {
+        let problem = v4l2::look_for(&device).err()?;
+        Some(Finding::fail("cameras", format!("camera {name:?}: {problem}"), "plug it in, or name another one"))
+    });
+    missing.collect()
+}
+
 /// RealSense cameras that are plugged in, and whether those of the rig are.
 #[cfg(feature = "realsense")]
 fn realsense(rig: Option<&Rig>) -> Vec<Finding> {
@@ -398,8 +418,16 @@ fn senders(rig: &Rig) -> Vec<Finding> {
     let base = (rig.base.driver == BaseDriver::Udp).then(|| ("base".to_owned(), rig.base.address));
     let scanners = rig.scanners.iter().filter(|scanner| scanner.driver == ScannerDriver::Udp);
     let scanners = scanners.map(|scanner| (format!("range scanner {:?}", scanner.name), scanner.address));
-    base.into_iter()
-        .chain(scanners)
+    let arm = (rig.arm.driver == ArmDriver::Udp).then(|| open::udp_arm_address(rig));
+    let (arm, wrong) = match arm {
+        Some(Ok(address)) => (Some(("arm".to_owned(), address)), None),
+        Some(Err(error)) => {
+            (None, Some(Finding::fail("udp", format!("{error:#}"), "arm.address = \"127.0.0.1:7011\"")))
+        }
+        None => (None, None),
+    };
+    let addresses = base.into_iter().chain(arm).chain(scanners);
+    let findings = addresses
         .map(|(device, address)| match UdpSocket::bind(address) {
             Ok(_) => Finding::ok("udp", format!("{device}: {address} is free to listen on")),
             Err(error) => {
@@ -411,7 +439,19 @@ fn senders(rig: &Rig) -> Vec<Finding> {
                 )
             }
         })
-        .collect()
+        .chain(wrong);
+    findings.collect()
+}
+
+/// Whether the arm can be moved as the rig file wants it, as far as that is known without it.
+fn motion(rig: &Rig) -> Option<Finding> {
+    rig.arm.motion.as_ref().filter(|_| matches!(rig.arm.driver, ArmDriver::Can | ArmDriver::Franka))?;
+    Some(match open::check_motion(rig) {
+        Ok(()) => Finding::ok("motion", "[arm.motion] asks for what this kind of arm can do"),
+        Err(error) => {
+            Finding::fail("motion", format!("{error:#}"), "docs/hardware.md tells what belongs into [arm.motion]")
+        }
+    })
 }
 
 /// Whether the files that cameras play are there.

@@ -95,7 +95,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             }
         }
         let began = clock::now();
-        let last = mover.follow(&target)?;
+        let last = mover.follow(&target).inspect_err(|error| {
+            if args.json {
+                // What stdout does with it changes nothing.
+                let _ = print::json(&serde_json::json!({ "event": "stopped", "reason": format!("{error:#}") }));
+            }
+        })?;
         tell(args, &rig.arm.joints, &target, &last, began)?;
     }
     if motion.on_loss != OnLoss::Hold && !args.leave {
@@ -114,7 +119,8 @@ fn check(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
         return Err(BadArgument(format!("--to has {n} positions, the arm has {} joints: {names}", joints.len())));
     }
     if let Some((joint, _)) = args.by.iter().find(|(joint, _)| !joints.contains(joint)) {
-        return Err(BadArgument(format!("--by: there is no joint {joint:?}, but {}", joints.join(", "))));
+        let there = if joints.is_empty() { "none".to_owned() } else { joints.join(", ") };
+        return Err(BadArgument(format!("--by: there is no joint {joint:?}; there are: {there}")));
     }
     Ok(())
 }

@@ -1,6 +1,7 @@
 //! `fieldrig record`: what the devices say, into a file, and nothing else.
 
-use crate::config::{ArmDriver, Override, Rig};
+use super::within;
+use crate::config::{ArmDriver, BaseDriver, Override, Rig};
 use crate::exit::{self, BadArgument, Exit, LackOfEvidence};
 use crate::open::{self, Devices, Opened};
 use crate::print;
@@ -27,7 +28,7 @@ pub(crate) struct Args {
     lockstep: bool,
     /// Stop after S seconds of the devices' time [default: until Ctrl-C or the devices' end; needed with --lockstep, unless
     /// the rig file says when the simulation ends]
-    #[arg(long, value_name = "S")]
+    #[arg(long, value_name = "S", value_parser = within(0.1..=1e7))]
     seconds: Option<f64>,
     /// Print one JSON object a line
     #[arg(long)]
@@ -100,6 +101,14 @@ impl Recorded {
         told
     }
 
+    /// Devices of the rig that told nothing at all.
+    fn silent(&self, rig: &Rig) -> Vec<String> {
+        let arm = (rig.arm.driver != ArmDriver::None && self.joint_states == 0).then_some("joint state of the arm");
+        let base = (rig.base.driver != BaseDriver::Fixed && self.base_poses == 0).then_some("pose of the base");
+        let images = (self.images == 0).then_some("image");
+        [arm, base, images].into_iter().flatten().map(|what| format!("no {what} was recorded")).collect()
+    }
+
     /// What did not come, a sentence a camera.
     fn losses(&self) -> Vec<String> {
         let sentence = |(camera, lost): (&String, &Lost)| {
@@ -127,6 +136,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let overrides = if args.lockstep { vec![Override::new("sim.lockstep", true)] } else { Vec::new() };
     let rig = Rig::load(&args.rig_file, &overrides)?;
     check_end(args, &rig)?;
+    if args.out.exists() {
+        return Err(drivers::Error::Exists { path: args.out.clone() }.into()); // Not after all devices are open.
+    }
     let Opened { rig, mut source, .. } = open::rig(rig, if args.sim { Devices::Sim } else { Devices::Real })?;
     let mut recorder = open::recorder(&args.out, &rig)?;
     let mut recorded = Recorded { event: "done", out: args.out.clone(), ..Recorded::default() };
@@ -178,5 +190,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         print::line(format_args!("{:.1} s, {} in {}", recorded.seconds, recorded.summary(), args.out.display()))?;
     }
     losses.extend(recorded.losses());
+    losses.extend(recorded.silent(&rig));
+    let n_dropped = source.n_others_dropped();
+    if n_dropped > 0 {
+        losses.push(format!("{n_dropped} joint states, base poses and range scans, because the disk was too slow"));
+    }
     Ok(exit::after(&losses))
 }

@@ -58,7 +58,16 @@ pub(super) fn read(keys: &mut Section<'_>) -> (Vec<BusConfig>, Vec<MotorConfig>)
     (buses, motors)
 }
 
+/// The system knows no longer names.
+const MAX_INTERFACE_BYTES: usize = 15;
+
 fn bus(interface: String, mut keys: Section<'_>) -> BusConfig {
+    let is_name = (1..=MAX_INTERFACE_BYTES).contains(&interface.len())
+        && !interface.contains(|letter: char| letter == '/' || letter.is_whitespace());
+    if !is_name {
+        let allowed = "the name of an interface, up to 15 letters without blanks and slashes, as the table's name";
+        keys.wrong::<()>("interface", &Value::from(interface.as_str()), allowed);
+    }
     let rate = |value: Option<u64>| value.and_then(|rate| u32::try_from(rate).ok());
     let bus = BusConfig {
         interface,
@@ -128,7 +137,14 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
                 (Kind::TMotor, Some(Model::TMotor(model)), Some(motor)) => Some(Family::TMotor { motor, model }),
                 _ => None,
             };
-            if family.is_none() && id.is_some() {
+            let of_family = match (kind, model) {
+                (Kind::TMotor, Some(Model::Robstride(_))) => Some("ak10-9 to ak80-64, as the family is tmotor"),
+                (Kind::Robstride, Some(Model::TMotor(_))) => Some("rs00 to rs06, as the family is robstride"),
+                _ => None,
+            };
+            if let (Some(allowed), Some(value)) = (of_family, model.and_then(|model| name_of(&MODELS, &model))) {
+                keys.wrong::<()>("model", &value, allowed);
+            } else if family.is_none() && id.is_some() {
                 keys.missing("model", "what is on the motor: rs00 to rs06 of Robstride, ak10-9 to ak80-64 of T-Motor");
             }
             family

@@ -442,6 +442,21 @@ fn an_arm_on_can_buses_has_a_motor_for_each_joint() {
     let same = parse(&text(["j1", "j2"]).replace("odrive\"", "damiao\"\nfeedback_id = 18"), &[]);
     let refused = same.expect_err("both answer as 18").to_string();
     assert!(refused.contains("\"j1\" and \"j2\" have the same number on \"can0\""), "{refused}");
+    let answers = parse(&text(["j1", "j2"]).replace("odrive\"", "damiao\"\nfeedback_id = 2"), &[]);
+    let refused = answers.expect_err("the first would take the second one's answers for orders").to_string();
+    assert!(refused.contains("the same number"), "{refused}");
+    let named = |interface: &str| {
+        let text = text(["j1", "j2"]).replace("arm.bus.can0", &format!("arm.bus.{interface:?}"));
+        parse(&text.replace("\"can0\"", &format!("{interface:?}")), &[])
+    };
+    assert!(named("can-first").is_ok());
+    for wrong in ["", "can/0", "can 0", "a_name_of_sixteen"] {
+        let refused = named(wrong).expect_err("no such interface can be").to_string();
+        assert!(refused.contains("up to 15 letters"), "{wrong}: {refused}");
+    }
+    let other = text(["j1", "j2"]).replace("odrive\"", "robstride\"\nmodel = \"ak80-9\"");
+    let refused = parse(&other, &[]).expect_err("of another maker").to_string();
+    assert!(refused.contains("arm.motor.j2.model") && refused.contains("rs00 to rs06"), "{refused}");
     let refused = with("arm.driver", "'can'").expect_err("no motors for its joints").to_string();
     assert!(refused.contains("arm.motor"), "{refused}");
     let foreign = with("arm.motor.first.model", "'rs01'").expect_err("Damiao motors tell it themselves").to_string();

@@ -45,6 +45,8 @@ pub(crate) struct Join {
     /// The first image that was asked about the list.
     first_seen: Option<(Arc<str>, Stamp)>,
     counts: Counts,
+    /// That a joint is where it cannot be was told.
+    told_strange: bool,
     max_wait_secs: f64,
     default_depth_m: f64,
     /// The latest stamp of all samples: the only clock there is.
@@ -109,6 +111,7 @@ impl Join {
             list: None,
             first_seen: None,
             counts: Counts::default(),
+            told_strange: false,
             max_wait_secs: join.max_wait_millis * 1e-3,
             default_depth_m: join.default_depth_m,
             newest: Stamp(i64::MIN),
@@ -128,6 +131,12 @@ impl Join {
         self.newest = self.newest.max(sample.stamp());
         match sample {
             Sample::Joints(state) => {
+                if !self.told_strange
+                    && let Some(strange) = self.motion.strange(&state)
+                {
+                    log::warn!("{strange}");
+                    self.told_strange = true;
+                }
                 let sensible = self.motion.push_joints(state);
                 self.counts.joints_refused += u64::from(!sensible);
             }

@@ -12,6 +12,8 @@ use trainer::BasePlace;
 
 /// Readings kept: 20 s at 1 kHz, more than any image waits.
 const MAX_READINGS: usize = 20_000;
+/// How far beyond its range a joint may be found: calibrations and soft ends do less, radians or metres.
+const MAX_BEYOND: f64 = 0.2;
 /// Images of a camera between whose poses by tags the base's pose is interpolated: one may be without.
 const MAX_IMAGES_BETWEEN: f64 = 2.5;
 
@@ -70,6 +72,22 @@ impl Motion {
         };
         let offsets = order.iter().map(|ix| rig.arm.joint_offsets.get(*ix).copied().unwrap_or(0.0)).collect();
         Ok(Self { chain, order, offsets, joints: JointHistory::new(max_gap, MAX_READINGS), base })
+    }
+
+    /// A sentence on the first joint that is told to be where the robot's description says that it cannot be.
+    pub(super) fn strange(&self, state: &JointState) -> Option<String> {
+        let joints = self.chain.joint_names().iter().zip(self.chain.limits()).zip(self.order.iter().zip(&self.offsets));
+        joints.into_iter().find_map(|((name, limits), (ix, offset))| {
+            let position = state.position.get(*ix)? + offset;
+            let is_far = position < limits.lower - MAX_BEYOND || position > limits.upper + MAX_BEYOND;
+            is_far.then(|| {
+                format!(
+                    "joint {name:?} is told to be at {position:.3}, and its range is {:.3} to {:.3}: is it told in degrees, or has an \
+                     offset?",
+                    limits.lower, limits.upper
+                )
+            })
+        })
     }
 
     /// Takes joint readings in the order of the device; says whether they made sense.

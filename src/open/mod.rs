@@ -9,9 +9,8 @@ mod simulated_tests;
 mod tags;
 
 #[cfg(all(feature = "sim", feature = "realsense", target_os = "linux"))]
-pub(crate) use real::{franka_chain, udp_arm_address};
-
-pub(crate) use real::movable_arm;
+pub(crate) use real::franka_chain;
+pub(crate) use real::{check_motion, movable_arm, udp_arm_address};
 
 use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, ScannerDriver};
 use anyhow::{Context, anyhow, bail};

@@ -68,6 +68,18 @@ pub(crate) fn movable_arm(rig: &Rig) -> anyhow::Result<Box<dyn MovableArm>> {
     }
 }
 
+/// Checks what of that can be checked without the arm.
+pub(crate) fn check_motion(rig: &Rig) -> anyhow::Result<()> {
+    let Some(motion) = &rig.arm.motion else { return Ok(()) };
+    match rig.arm.driver {
+        #[cfg(target_os = "linux")]
+        ArmDriver::Can => Ok(MovableCanArm::check(&movable_config(rig, motion)?)?),
+        #[cfg(target_os = "linux")]
+        ArmDriver::Franka => Ok(MovableFrankaArm::check(&motion_config(rig, motion)?).map_err(anyhow::Error::msg)?),
+        _ => bail!("arms of this driver are only read"),
+    }
+}
+
 /// How each joint may be moved: the description's limits, the rig's speed.
 #[cfg(target_os = "linux")]
 fn motion_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MotionConfig> {
@@ -90,14 +102,18 @@ fn motion_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MotionConfig> 
 
 #[cfg(target_os = "linux")]
 fn movable_can_arm(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<Box<dyn MovableArm>> {
+    Ok(Box::new(MovableCanArm::open(&movable_config(rig, motion)?)?))
+}
+
+#[cfg(target_os = "linux")]
+fn movable_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MovableArmConfig> {
     let path = &motion.odrive_endpoints;
     let endpoints = || -> anyhow::Result<Endpoints> { Ok(Endpoints::parse(&std::fs::read_to_string(path)?)?) };
     let odrive_endpoints = match path.as_str() {
         "" => None,
         _ => Some(endpoints().with_context(|| format!("arm.motion.odrive_endpoints {path:?}"))?),
     };
-    let config = MovableArmConfig { arm: can_config(rig), motion: motion_config(rig, motion)?, odrive_endpoints };
-    Ok(Box::new(MovableCanArm::open(&config)?))
+    Ok(MovableArmConfig { arm: can_config(rig), motion: motion_config(rig, motion)?, odrive_endpoints })
 }
 
 #[cfg(not(target_os = "linux"))]

@@ -62,6 +62,10 @@ impl Source for RealTime {
         let past_end = |sample: &Sample| self.end.is_some_and(|end| sample.stamp() >= end);
         Ok(sample.filter(|sample| !past_end(sample)))
     }
+
+    fn n_others_dropped(&self) -> u64 {
+        self.live.n_others_dropped()
+    }
 }
 
 /// The simulator's configuration of a rig.

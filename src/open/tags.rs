@@ -147,7 +147,11 @@ impl WithTags {
             }
             // Two cameras at once: the other one was first.
             Ok(_) => {}
-            Err(why) => self.miss(stamp, &camera.name.clone(), why),
+            Err(why) => {
+                let name = camera.name.clone();
+                let seen: Vec<_> = sighting.tags.iter().map(|tag| tag.id.to_string()).collect();
+                self.miss(stamp, &name, &seen, why);
+            }
         }
     }
 
@@ -158,7 +162,7 @@ impl WithTags {
     }
 
     /// Counts an image without a pose, and tells of a long time without any.
-    fn miss(&mut self, stamp: Stamp, camera: &str, why: Unlocated) {
+    fn miss(&mut self, stamp: Stamp, camera: &str, seen: &[String], why: Unlocated) {
         match why {
             Unlocated::NoTag => self.counts.n_without_tag += 1,
             Unlocated::Ambiguous => self.counts.n_ambiguous += 1,
@@ -173,7 +177,11 @@ impl WithTags {
         }
         let since = *self.told.get_or_insert(self.newest.unwrap_or(stamp));
         if stamp.secs_since(since) >= UNTIL_TOLD_SECS {
-            log::warn!("base: no pose for {:.0} s; camera {camera:?}: {why}", stamp.secs_since(since));
+            let others = match why {
+                Unlocated::NoTag if !seen.is_empty() => format!(", but the tags {}", seen.join(", ")),
+                _ => String::new(),
+            };
+            log::warn!("base: no pose for {:.0} s; camera {camera:?}: {why}{others}", stamp.secs_since(since));
             self.told = Some(stamp);
         }
     }
@@ -199,6 +207,10 @@ impl Source for WithTags {
             _ => {}
         }
         Ok(Some(sample))
+    }
+
+    fn n_others_dropped(&self) -> u64 {
+        self.source.n_others_dropped()
     }
 }
 

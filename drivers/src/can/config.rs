@@ -77,7 +77,10 @@ impl Family {
     /// Whether it could not be told from another one on the same bus.
     pub fn clashes(&self, other: &Self) -> bool {
         match (self, other) {
-            (Self::Damiao { motor: a, feedback: b }, Self::Damiao { motor: c, feedback: d }) => a == c || b == d,
+            // It would take the other one's answers for orders.
+            (Self::Damiao { motor: a, feedback: b }, Self::Damiao { motor: c, feedback: d }) => {
+                a == c || b == d || a == d || b == c
+            }
             (Self::Robstride { motor: a, .. }, Self::Robstride { motor: b, .. })
             | (Self::TMotor { motor: a, .. }, Self::TMotor { motor: b, .. }) => a == b,
             (Self::Odrive { node: a }, Self::Odrive { node: b }) => a == b,

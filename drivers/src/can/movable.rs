@@ -7,6 +7,7 @@ use super::arm::MAX_WAITING;
 use super::config::ArmConfig;
 use super::joints::{Joints, Told};
 use super::moving::{Moving, Request};
+use super::watchdog::Plan;
 use crate::motion::{JointTarget, Motion, MotionConfig, MovableArm};
 use crate::wire::can::odrive::Endpoints;
 use crate::{Arm, Error};
@@ -48,6 +49,11 @@ pub struct MovableCanArm {
 }
 
 impl MovableCanArm {
+    /// Checks what can be checked without the motors: limits, and whether each of them can do what is asked for.
+    pub fn check(config: &MovableArmConfig) -> Result<(), Error> {
+        Plan::new(config).map(drop)
+    }
+
     /// Checks what the motors can do, sets their timeouts and reads them back, and switches them on, held where they are.
     ///
     /// Where anything fails, all of them are left switched off.

@@ -100,7 +100,7 @@ pub(super) struct Moving {
 }
 
 impl Moving {
-    /// Checks all that can be checked before anything is sent.
+    /// Fails where the arm cannot be moved as planned; nothing is sent.
     pub(super) fn new(
         config: &MovableArmConfig,
         requests: Receiver<Request>,
@@ -108,30 +108,7 @@ impl Moving {
         motion: Arc<Mutex<Motion>>,
         is_ending: Arc<AtomicBool>,
     ) -> Result<Self, Error> {
-        let (arm, wanted) = (&config.arm, &config.motion);
-        if wanted.limits.len() != arm.motors.len() {
-            let reason = format!("there are limits for {} joints of {}", wanted.limits.len(), arm.motors.len());
-            return Err(Error::Motion { reason });
-        }
-        let host = free_node(config)?;
-        let plan = Plan {
-            on_loss: wanted.on_loss,
-            timeout: wanted.timeout,
-            accept_no_watchdog: wanted.accept_no_watchdog,
-            endpoints: config.odrive_endpoints.clone(),
-            period: period(config, host),
-            host,
-        };
-        for motor in &arm.motors {
-            plan.check(motor, &arm.buses[motor.bus_ix].interface)?;
-        }
-        if plan.timeout < MIN_CYCLES * plan.period {
-            let reason = format!(
-                "arm.motion.timeout_millis must leave room for {MIN_CYCLES} cycles of {:.1} ms",
-                1e3 * plan.period.as_secs_f64()
-            );
-            return Err(Error::Motion { reason });
-        }
+        let plan = Plan::new(config)?;
         let phase = Phase::stopped(clock::now(), None);
         Ok(Self {
             config: config.clone(),
@@ -453,6 +430,37 @@ impl Moving {
             );
         }
         *told = None;
+    }
+}
+
+impl Plan {
+    /// Checks all that can be checked before anything is sent.
+    pub(super) fn new(config: &MovableArmConfig) -> Result<Self, Error> {
+        let (arm, wanted) = (&config.arm, &config.motion);
+        if wanted.limits.len() != arm.motors.len() {
+            let reason = format!("there are limits for {} joints of {}", wanted.limits.len(), arm.motors.len());
+            return Err(Error::Motion { reason });
+        }
+        let host = free_node(config)?;
+        let plan = Self {
+            on_loss: wanted.on_loss,
+            timeout: wanted.timeout,
+            accept_no_watchdog: wanted.accept_no_watchdog,
+            endpoints: config.odrive_endpoints.clone(),
+            period: period(config, host),
+            host,
+        };
+        for motor in &arm.motors {
+            plan.check(motor, &arm.buses[motor.bus_ix].interface)?;
+        }
+        if plan.timeout < MIN_CYCLES * plan.period {
+            let reason = format!(
+                "arm.motion.timeout_millis must leave room for {MIN_CYCLES} cycles of {:.1} ms",
+                1e3 * plan.period.as_secs_f64()
+            );
+            return Err(Error::Motion { reason });
+        }
+        Ok(plan)
     }
 }
 

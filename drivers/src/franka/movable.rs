@@ -36,6 +36,22 @@ pub struct MovableFrankaArm {
 }
 
 impl MovableFrankaArm {
+    /// Checks what can be checked without the robot; why it cannot be moved so is told.
+    pub fn check(motion: &MotionConfig) -> Result<(), String> {
+        if motion.on_loss != OnLoss::Hold {
+            let reason = "when its commands cease it brakes and holds by itself, and cannot be told to do otherwise: \
+                          arm.motion.on_loss = \"hold\" is the one that it does";
+            return Err(reason.to_owned());
+        }
+        if motion.timeout < ROBOT_TIMEOUT {
+            let timeout = motion.timeout;
+            return Err(format!(
+                "it notices missing commands after {ROBOT_TIMEOUT:?}, which cannot be set; arm.motion.timeout_millis asks for {timeout:?}"
+            ));
+        }
+        Ok(())
+    }
+
     /// Connects as [`FrankaArm::open`] does, and prepares to move; nothing moves, and nothing is set, before the first target.
     ///
     /// `motion.limits` are in the order of the joints. They are brought within half of what the robot allows (of its jerk an
@@ -43,18 +59,7 @@ impl MovableFrankaArm {
     /// refused.
     pub fn open(config: &ArmConfig, motion: &MotionConfig, contact: &ContactConfig) -> Result<Self, Error> {
         let address = config.address.clone();
-        let fault = |reason| Error::Fci { address: address.clone(), reason };
-        if motion.on_loss != OnLoss::Hold {
-            let reason = "when its commands cease it brakes and holds by itself, and cannot be told to do otherwise: \
-                          on_loss = \"hold\" is the one that it does";
-            return Err(fault(reason.to_owned()));
-        }
-        if motion.timeout < ROBOT_TIMEOUT {
-            let timeout = motion.timeout;
-            return Err(fault(format!(
-                "it notices missing commands after {ROBOT_TIMEOUT:?}, which cannot be set; {timeout:?} is asked for"
-            )));
-        }
+        Self::check(motion).map_err(|reason| Error::Fci { address: address.clone(), reason })?;
         let desk = Arc::new(Desk::default());
         let made = OnceLock::new();
         let arm = FrankaArm::open_with(config, |session, first| {

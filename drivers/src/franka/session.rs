@@ -65,7 +65,8 @@ fn number(version: FciVersion) -> u16 {
 fn connect(address: &str, version: u16) -> Result<Answer, String> {
     let network =
         Network::connect_with_timeouts(address, ROBOT_COMMAND_PORT, HeaderLayout::Robot, DEFAULT_CONNECT_TIMEOUT, POLL);
-    let network = network.map_err(|error| format!("{} {WAY_BESIDE}", sentence(&error)))?;
+    // Nobody is there, or nobody by this name: other clients are not the cause.
+    let network = network.map_err(|error| sentence(&error))?;
     let mut request = version.to_le_bytes().to_vec();
     request.extend(network.udp.port().to_le_bytes());
     let hung_up = |error: FrankaError| format!("it hung up ({}). {WAY_BESIDE}", sentence(&error).trim_end_matches('.'));

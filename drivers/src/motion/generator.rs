@@ -14,6 +14,9 @@ use std::time::Duration;
 /// without us and is too fast to stop before the end of the range.
 const MAX_OUTSIDE: f64 = 0.02;
 
+/// Shares of jerk that are tried to be done without where no way is found with all of it.
+const SOFTER: [f64; 3] = [1e-6, 1e-4, 1e-2];
+
 /// Where joints are to be at an instant, in their order; radians or metres, and seconds.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Setpoint {
@@ -122,6 +125,18 @@ impl Generator {
         self.is_held
     }
 
+    /// A step on a way with a little less jerk: `rsruckig` finds none where a joint comes to its full acceleration for no time at all,
+    /// as it does for some round distances.
+    fn softer(&mut self) -> Option<RuckigResult> {
+        let full = self.input.max_jerk.clone();
+        let result = SOFTER.iter().find_map(|less| {
+            self.input.max_jerk = list(full.iter().map(|jerk| jerk * (1.0 - less)));
+            self.ruckig.update(&self.input, &mut self.output).ok()
+        });
+        self.input.max_jerk = full;
+        result
+    }
+
     /// A step on a way that leaves the ranges a little and comes back, where none stays inside; `None` where that is no help.
     /// A stop is as short as it can be, wherever it ends.
     fn overshoot(&mut self) -> Option<RuckigResult> {
@@ -146,7 +161,7 @@ impl Generator {
     pub fn step(&mut self) -> Result<Setpoint, String> {
         if !self.is_held {
             let result = match self.ruckig.update(&self.input, &mut self.output) {
-                Err(why) => self.overshoot().ok_or_else(|| told(&why))?,
+                Err(why) => self.softer().or_else(|| self.overshoot()).ok_or_else(|| told(&why))?,
                 Ok(result) => result,
             };
             self.output.pass_to_input(&mut self.input);
@@ -182,7 +197,12 @@ fn list(numbers: impl Iterator<Item = f64>) -> DataArrayOrVec<f64, 0> {
 }
 
 fn told(error: &RuckigError) -> String {
-    format!("no way to the target was found: {error}")
+    // What follows is what it was asked.
+    let told = error.to_string();
+    format!(
+        "no way to the target was found: {}",
+        told.lines().next().unwrap_or_default().trim_end_matches("input: ").trim()
+    )
 }
 
 #[cfg(test)]
@@ -315,6 +335,29 @@ mod tests {
         generator.stop();
         while !generator.is_held() {
             generator.step().unwrap();
+        }
+    }
+
+    #[test]
+    fn distances_at_which_full_acceleration_is_reached_for_no_time_are_gone_as_others_are() {
+        for (velocity, start) in [(0.5, -1.3), (0.2, 0.07), (0.1, 0.0), (1.0, 0.4)] {
+            let (acceleration, jerk) = (velocity / 0.5, velocity / 0.5 / 0.1);
+            let joint = MotionLimits { position: [-2.0, 2.0], velocity, acceleration, jerk };
+            for sign in [1.0, -1.0] {
+                let target = start + sign * 2.0 * acceleration.powi(3) / jerk.powi(2);
+                let mut generator = Generator::new(&[joint, joint], &[start, 0.3], PERIOD).unwrap();
+                generator.head_for(&JointTarget { position: vec![target, 0.3] }).unwrap();
+                let mut way = vec![generator.step().unwrap()];
+                while !generator.is_held() {
+                    way.push(generator.step().unwrap());
+                    let [.., before, now] = &way[..] else { continue };
+                    let jerk_now = (now.acceleration[0] - before.acceleration[0]) / PERIOD.as_secs_f64();
+                    assert!(jerk_now.abs() <= jerk * 1.0001 && now.acceleration[0].abs() <= acceleration * 1.0001);
+                }
+                // Four times as long as it takes to come to full acceleration.
+                assert!((way.len() as f64 - 400.0).abs() < 3.0, "{}", way.len());
+                assert!((way[way.len() - 1].position[0] - target).abs() < 1e-9);
+            }
         }
     }
 

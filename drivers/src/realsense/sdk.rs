@@ -13,6 +13,7 @@ use std::ffi::{CStr, CString};
 use std::mem::MaybeUninit;
 use std::path::Path;
 use std::ptr::{NonNull, null_mut};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 /// A frame of any kind of image, whatever the wrapper's type is called; which, its profile says.
@@ -46,6 +47,16 @@ pub(super) struct Context(NonNull<sys::rs2_context>);
 // SAFETY: the library may be called from any thread, and we hold the only pointer.
 unsafe impl Send for Context {}
 
+/// Held while a device is made. The library notes in one list of the process how its streams lie to each other, and two threads that
+/// add to it at once write into freed memory (librealsense 2.56.5, `extrinsics_graph::register_extrinsics`).
+static MAKING: Mutex<()> = Mutex::new(());
+
+/// Keeps other threads from making devices meanwhile.
+pub(super) fn making() -> MutexGuard<'static, ()> {
+    // There is nothing behind it that a thread that panicked could have left half done.
+    MAKING.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 impl Context {
     pub(super) fn new() -> Result<Self, Problem> {
         const WHAT: &str = "start";
@@ -62,6 +73,7 @@ impl Context {
     pub(super) fn devices(&self) -> Result<Vec<Device>, Problem> {
         const WHAT: &str = "list devices";
         let any = sys::RS2_PRODUCT_LINE_ANY_INTEL.cast_signed();
+        let _alone = making();
         // SAFETY: the context lives; the list is freed below, and devices outlive it.
         unsafe {
             let list = call(WHAT, |error| sys::rs2_query_devices_ex(self.0.as_ptr(), any, error))?;
@@ -81,6 +93,7 @@ impl Context {
             return Err(refused(error.to_string()));
         }
         let name = path_name(path).map_err(refused)?;
+        let _alone = making();
         // SAFETY: the context lives, the name ends with a zero; the device is checked and then ours.
         let device = unsafe {
             let device =

@@ -136,6 +136,7 @@ mod tests {
             camera: "wrist".into(),
             pace,
             offset_nanos: 5,
+            opened: Stamp(0),
             micros: WrappingMicros::new(),
             map: ClockMap::new(),
             first: None,

@@ -60,7 +60,7 @@ pub(crate) fn joint_states(bytes: &[u8]) -> Vec<Vec<f64>> {
         for line in bytes.split(|byte| *byte == b'\n') {
             let millis = str::from_utf8(line).ok().and_then(|line| line.parse::<u32>().ok());
             at += Duration::from_millis(millis.unwrap_or(1).into());
-            let arrived = Arrived { at, bytes: line.to_vec(), n_dropped: 0 };
+            let arrived = Arrived { at, from: ([127, 0, 0, 1], 7).into(), bytes: line.to_vec(), n_dropped: 0 };
             let read = arm.take(&arrived, |bytes| decode_joints(bytes, names).map(|told| (told.head, told)));
             if let Some((stamp, state)) = read {
                 assert_grows(&mut newest[0], stamp, at);

@@ -53,6 +53,11 @@ impl Order {
         place
     }
 
+    /// How often the sender's clock was found to have begun again, jumped, or not to count nanoseconds.
+    pub(crate) fn n_clock_restarts(&self) -> u64 {
+        self.clock.n_restarts()
+    }
+
     /// Our time of what a new datagram tells; `None` where that cannot be, or is not after the newest.
     pub(crate) fn stamp(&mut self, head: &Head, arrival: Stamp) -> Option<Stamp> {
         let stamp = match head.clock {

@@ -15,12 +15,15 @@ const MAX_WAITING_BYTES: usize = 16 << 20;
 const OVERHEAD_BYTES: usize = 128;
 /// No datagram is longer.
 const MAX_DATAGRAM_BYTES: usize = 65_536;
+/// What came so long before it is asked for the first time is not wanted: other devices were still being opened.
+const MAX_EARLY: Duration = Duration::from_millis(200);
 /// How soon the thread notices that it is to stop.
 const POLL: Duration = Duration::from_millis(100);
 
 /// One datagram.
 pub(super) struct Arrived {
     pub(super) at: Stamp,
+    pub(super) from: SocketAddr,
     pub(super) bytes: Vec<u8>,
     /// Those before it that gave way.
     pub(super) n_dropped: u64,
@@ -43,10 +46,12 @@ struct Shared {
 
 #[derive(Debug, Default)]
 struct State {
-    queue: VecDeque<(Stamp, Vec<u8>)>,
+    queue: VecDeque<(Stamp, SocketAddr, Vec<u8>)>,
     n_bytes: usize,
     n_dropped: u64,
     error: Option<std::io::Error>,
+    /// Somebody has asked for datagrams.
+    is_read: bool,
     stop: bool,
 }
 
@@ -86,10 +91,13 @@ impl Receiver {
     /// The oldest datagram that waits; `None` when none came until then.
     pub(super) fn next(&self, until: Instant) -> Result<Option<Arrived>, Error> {
         let mut state = self.shared.lock();
+        if !std::mem::replace(&mut state.is_read, true) {
+            state.forget_before(clock::now() - MAX_EARLY);
+        }
         loop {
-            if let Some((at, bytes)) = state.queue.pop_front() {
+            if let Some((at, from, bytes)) = state.queue.pop_front() {
                 state.n_bytes -= bytes.len() + OVERHEAD_BYTES;
-                return Ok(Some(Arrived { at, bytes, n_dropped: std::mem::take(&mut state.n_dropped) }));
+                return Ok(Some(Arrived { at, from, bytes, n_dropped: std::mem::take(&mut state.n_dropped) }));
             }
             if let Some(source) = state.error.take() {
                 return Err(Error::Network { device: self.device.clone(), source });
@@ -112,14 +120,14 @@ impl Shared {
     fn read(&self, socket: &UdpSocket) {
         let mut buffer = vec![0; MAX_DATAGRAM_BYTES];
         loop {
-            let received = socket.recv(&mut buffer);
+            let received = socket.recv_from(&mut buffer);
             let at = clock::now();
             let mut state = self.lock();
             if state.stop {
                 return;
             }
             match received {
-                Ok(n) => state.put(at, buffer[..n].to_vec()),
+                Ok((n, from)) => state.put(at, from, buffer[..n].to_vec()),
                 Err(error)
                     if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) =>
                 {
@@ -137,11 +145,20 @@ impl Shared {
 }
 
 impl State {
-    fn put(&mut self, at: Stamp, bytes: Vec<u8>) {
+    fn forget_before(&mut self, begin: Stamp) {
+        while self.queue.front().is_some_and(|(at, ..)| *at < begin)
+            && let Some((.., early)) = self.queue.pop_front()
+        {
+            self.n_bytes -= early.len() + OVERHEAD_BYTES;
+        }
+        self.n_dropped = 0;
+    }
+
+    fn put(&mut self, at: Stamp, from: SocketAddr, bytes: Vec<u8>) {
         self.n_bytes += bytes.len() + OVERHEAD_BYTES;
-        self.queue.push_back((at, bytes));
+        self.queue.push_back((at, from, bytes));
         while self.n_bytes > MAX_WAITING_BYTES
-            && let Some((_, oldest)) = self.queue.pop_front()
+            && let Some((.., oldest)) = self.queue.pop_front()
         {
             self.n_bytes -= oldest.len() + OVERHEAD_BYTES;
             self.n_dropped += 1;
@@ -162,19 +179,32 @@ impl Drop for Receiver {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::net::Ipv4Addr;
+
+    const SENDER: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::LOCALHOST), 7);
+
+    #[test]
+    fn what_came_before_anybody_asked_is_forgotten_but_for_the_newest() {
+        let mut state = State { n_dropped: 3, ..State::default() };
+        (0..10).for_each(|ix| state.put(Stamp(ix), SENDER, vec![0; 5]));
+        state.forget_before(Stamp(7));
+        assert_eq!((state.queue.len(), state.n_bytes, state.n_dropped), (3, 3 * (5 + OVERHEAD_BYTES), 0));
+        state.forget_before(Stamp(100));
+        assert_eq!((state.queue.len(), state.n_bytes), (0, 0));
+    }
 
     #[test]
     fn a_slow_caller_loses_the_oldest_and_memory_is_bounded() {
         let mut state = State::default();
         for ix in 0..1000 {
-            state.put(Stamp(ix), vec![0; 60_000]);
+            state.put(Stamp(ix), SENDER, vec![0; 60_000]);
             assert!(state.n_bytes <= MAX_WAITING_BYTES);
         }
         let n_left = state.queue.len();
         assert_eq!(n_left as u64 + state.n_dropped, 1000);
         assert_eq!(state.queue.back().expect("the newest").0, Stamp(999));
         for ix in 0..1_000_000 {
-            state.put(Stamp(ix), Vec::new());
+            state.put(Stamp(ix), SENDER, Vec::new());
         }
         assert!(state.queue.len() <= MAX_WAITING_BYTES / OVERHEAD_BYTES, "empty datagrams are bounded too");
     }

@@ -101,6 +101,14 @@ pub(super) fn candidates(device: &str) -> Result<Vec<PathBuf>, Problem> {
     one_camera(device, found)
 }
 
+/// Looks whether something that is plugged in goes by this name of a rig file, without opening it more than to ask.
+pub fn look_for(device: &str) -> Result<(), Problem> {
+    match candidates(device)?.iter().any(|path| path.exists()) {
+        true => Ok(()),
+        false => Err(Problem::NoDevice { device: device.to_owned() }),
+    }
+}
+
 /// The paths of nodes once they are known to be of one camera: makers give serial numbers twice.
 fn one_camera(device: &str, found: Vec<Node>) -> Result<Vec<PathBuf>, Problem> {
     let device = device.to_owned();

@@ -33,7 +33,7 @@ pub use config::{Config, control, set_control};
 #[cfg(target_os = "linux")]
 pub use controls::Settings;
 #[cfg(target_os = "linux")]
-pub use find::{Found, cameras};
+pub use find::{Found, cameras, look_for};
 #[cfg(target_os = "linux")]
 pub use format::{Mode, Rates, Sizes, summary};
 pub use pixel_format::V4l2Format;

@@ -5,7 +5,7 @@
 
 mod abi;
 
-use super::sdk::{Context, Device, Mode, Modes, Queue, Sensor, call, made, path_name};
+use super::sdk::{Context, Device, Mode, Modes, Queue, Sensor, call, made, making, path_name};
 use super::{Problem, lens};
 use crate::{Image, PixelFormat, YuvLayout};
 use abi::{VideoFrame, VideoStream};
@@ -97,6 +97,7 @@ impl BagWriter {
     pub fn create(path: &Path, camera: &PlayedCamera) -> Result<Self, Problem> {
         let context = Context::new()?;
         let _ = std::fs::remove_file(path); // Not there, mostly; what cannot be removed the library cannot write, and says so.
+        let _alone = making();
         // SAFETY: the device is checked and then ours; sensors and profiles live as long as it does.
         let device = unsafe {
             let device = call("make a software device", |error| abi::rs2_create_software_device(error))?;
