@@ -1,6 +1,7 @@
 //! What became of the datagrams of one device.
 
 use std::fmt;
+use std::net::SocketAddr;
 
 /// Datagrams of one device since it was opened.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -19,6 +20,26 @@ pub struct Counts {
     pub n_unsure: u64,
     /// How often the sender began to count anew.
     pub n_restarts: u64,
+    /// How often its own clock began again or jumped; over and over, it does not count nanoseconds.
+    pub n_clock_restarts: u64,
+}
+
+/// What is said of a clock that did that.
+pub(super) const CLOCK_RESTARTED: &str = "the sender's clock began again or jumped, or it does not count nanoseconds";
+
+/// Who sends; there should be one a port, and one that began anew has another port of its own.
+#[derive(Debug, Default)]
+pub(super) struct Senders {
+    newest: Option<SocketAddr>,
+    n_changes: u64,
+}
+
+impl Senders {
+    pub(super) fn note(&mut self, device: &str, from: SocketAddr) {
+        if self.newest.replace(from).is_some_and(|before| before != from) {
+            tell(device, &mut self.n_changes, 1, format_args!("{from} sends, another one did before"));
+        }
+    }
 }
 
 /// Counts `more` of a kind, and logs it where that doubles the count at least: soon at first, and never a flood.
@@ -33,11 +54,12 @@ pub(super) fn tell(device: &str, n: &mut u64, more: u64, what: impl fmt::Display
 impl Counts {
     /// Logs what went wrong, if anything did.
     pub(super) fn summarize(&self, device: &str) {
-        let Self { n_received, n_refused, n_lost, n_late, n_dropped, n_unsure, n_restarts } = self;
-        if [n_refused, n_lost, n_late, n_dropped, n_unsure, n_restarts].iter().any(|n| **n > 0) {
+        let Self { n_received, n_refused, n_lost, n_late, n_dropped, n_unsure, n_restarts, n_clock_restarts } = self;
+        if [n_refused, n_lost, n_late, n_dropped, n_unsure, n_restarts, n_clock_restarts].iter().any(|n| **n > 0) {
             log::warn!(
                 "{device}: of {n_received} datagrams {n_refused} were refused, {n_late} came late or twice, {n_dropped} gave way \
-                 to newer ones, {n_unsure} were too unsure; {n_lost} scans, poses or parts were lost; the sender began anew {n_restarts} times"
+                 to newer ones, {n_unsure} were too unsure; {n_lost} scans, poses or parts were lost; the sender began anew {n_restarts} times, \
+                 its clock {n_clock_restarts} times"
             );
         }
     }

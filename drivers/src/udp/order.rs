@@ -117,6 +117,20 @@ mod tests {
     }
 
     #[test]
+    fn a_clock_that_does_not_count_nanoseconds_is_noticed() {
+        for (per_nano, is_right) in [(1.0, true), (1e-3, false), (1e-6, false), (1e3, false)] {
+            let mut order = Order::default();
+            for ix in 0..1000_i64 {
+                let nanos = ix * 10_000_000;
+                #[expect(clippy::cast_possible_truncation, reason = "ten seconds")]
+                let stamp_nanos = (nanos as f64 * per_nano) as i64;
+                order.stamp(&Head { seq: 0, clock: Clock::Device, stamp_nanos }, Stamp(nanos));
+            }
+            assert_eq!(order.n_clock_restarts() == 0, is_right, "{per_nano}: {}", order.n_clock_restarts());
+        }
+    }
+
+    #[test]
     fn stamps_grow_and_lie_shortly_before_their_arrival() {
         let mut order = Order::default();
         let mut at = |clock, stamp_nanos, arrival| order.stamp(&Head { seq: 0, clock, stamp_nanos }, Stamp(arrival));

@@ -1,7 +1,7 @@
 //! A range scanner whose turns come over UDP, each in one datagram or cut into parts.
 
-use super::counts::{Counts, tell};
-use super::order::{Order, Place};
+use super::counts::{CLOCK_RESTARTED, Counts, Senders, tell};
+use super::order::{self, Order, Place};
 use super::receiver::{Arrived, Receiver};
 use crate::wire::datagram::{Head, ScanPart, decode_scan};
 use crate::{Error, RangePoint, RangeScan, RangeScanner};
@@ -20,6 +20,7 @@ pub struct UdpScanner {
     receiver: Receiver,
     order: Order,
     counts: Counts,
+    senders: Senders,
     /// The turn whose parts are coming.
     turn: Option<Turn>,
     pub(super) done: VecDeque<RangeScan>,
@@ -41,6 +42,7 @@ impl UdpScanner {
             receiver,
             order: Order::default(),
             counts: Counts::default(),
+            senders: Senders::default(),
             turn: None,
             done: VecDeque::new(),
         })
@@ -74,6 +76,7 @@ impl UdpScanner {
         if *part.frame != *self.name {
             return self.refuse(format_args!("it is of another frame"));
         }
+        self.senders.note(device, arrived.from);
         match self.order.place(part.head.seq, arrived.at) {
             Place::New { n_lost } => {
                 tell(self.receiver.device(), &mut self.counts.n_lost, n_lost, "scans did not come");
@@ -91,9 +94,13 @@ impl UdpScanner {
     /// A new turn; what has come of the one before is all there will be.
     fn begin(&mut self, part: ScanPart, arrival: Stamp) {
         self.end_turn();
-        let Some(stamp) = self.order.stamp(&part.head, arrival) else {
-            let says = part.head.stamp_nanos;
-            return self.refuse(format_args!("the stamp {says} is not after the last, or not of now"));
+        let n_before = self.order.n_clock_restarts();
+        let stamp = self.order.stamp(&part.head, arrival);
+        let n_more = self.order.n_clock_restarts() - n_before;
+        tell(self.receiver.device(), &mut self.counts.n_clock_restarts, n_more, CLOCK_RESTARTED);
+        let Some(stamp) = stamp else {
+            let (says, hint) = (part.head.stamp_nanos, order::hint(&part.head, arrival));
+            return self.refuse(format_args!("the stamp {says} is not after the last, or not of now{hint}"));
         };
         let parts = vec![None; part.n_parts as usize];
         self.turn = Some(Turn { head: part.head, stamp, parts });

@@ -1,6 +1,6 @@
 //! Readings of which each comes whole in one datagram.
 
-use super::counts::{Counts, tell};
+use super::counts::{CLOCK_RESTARTED, Counts, Senders, tell};
 use super::order::{self, Order, Place};
 use super::receiver::{Arrived, Receiver};
 use crate::Error;
@@ -18,26 +18,15 @@ pub(super) struct WholeReadings {
     receiver: Receiver,
     pub(super) order: Order,
     pub(super) counts: Counts,
-    /// Who sent the newest.
-    from: Option<SocketAddr>,
-    /// How often that was another one than before.
-    n_senders: u64,
-    n_clock_restarts: u64,
+    senders: Senders,
 }
 
 impl WholeReadings {
     /// Listens; port 0 takes a free one.
     pub(super) fn open(device: &str, plural: &'static str, address: SocketAddr) -> Result<Self, Error> {
         let receiver = Receiver::open(device.to_owned(), address)?;
-        Ok(Self {
-            plural,
-            receiver,
-            order: Order::default(),
-            counts: Counts::default(),
-            from: None,
-            n_senders: 0,
-            n_clock_restarts: 0,
-        })
+        let (order, counts, senders) = (Order::default(), Counts::default(), Senders::default());
+        Ok(Self { plural, receiver, order, counts, senders })
     }
 
     /// Where it listens.
@@ -73,7 +62,7 @@ impl WholeReadings {
         arrived: &Arrived,
         decode: impl Fn(&[u8]) -> Result<(Head, T), Malformed>,
     ) -> Option<(Stamp, T)> {
-        let Self { plural, receiver, order, counts, from, n_senders, n_clock_restarts } = self;
+        let Self { plural, receiver, order, counts, senders } = self;
         let device = receiver.device();
         counts.n_received += 1;
         tell(device, &mut counts.n_dropped, arrived.n_dropped, format_args!("{plural} gave way to newer ones"));
@@ -94,11 +83,8 @@ impl WholeReadings {
         }
         let n_before = order.n_clock_restarts();
         let stamp = order.stamp(&head, arrived.at);
-        let what = "the sender's clock began again or jumped, or it does not count nanoseconds";
-        tell(device, n_clock_restarts, order.n_clock_restarts() - n_before, what);
-        if from.replace(arrived.from).is_some_and(|before| before != arrived.from) {
-            tell(device, n_senders, 1, format_args!("{} sends, another one did before", arrived.from));
-        }
+        tell(device, &mut counts.n_clock_restarts, order.n_clock_restarts() - n_before, CLOCK_RESTARTED);
+        senders.note(device, arrived.from);
         if stamp.is_none() {
             let says = head.stamp_nanos;
             let hint = order::hint(&head, arrived.at);
