@@ -3,7 +3,7 @@
 use super::Finding;
 use crate::bench::statistics::quantile;
 use crate::config::{BaseDriver, Rig};
-use crate::join::{Join, JoinEvent};
+use crate::join::{Join, JoinEvent, Refusal};
 use crate::open::{self, Devices, Opened};
 use crate::stop::Stop;
 use drivers::{Sample, clock};
@@ -139,8 +139,15 @@ pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Heard>
         .collect();
     findings.extend(devices.iter().filter_map(complaint));
     let refused: Vec<_> = join.counts().refused.iter().map(|(why, n)| format!("{n} {}", why.name())).collect();
+    let n_posed = join.counts().images - join.counts().refused.get(&Refusal::NoPose).copied().unwrap_or(0);
     if !refused.is_empty() {
-        findings.push(Finding::ok("join", format!("images that became no keyframe: {}", refused.join(", "))));
+        let says = format!("images that became no keyframe: {}", refused.join(", "));
+        findings.push(if 2 * n_posed < join.counts().images {
+            let mend = "joint states, and poses of the base where it moves, have to be there around each image: look at who tells them";
+            Finding::warn("join", says, mend)
+        } else {
+            Finding::ok("join", says)
+        });
     }
     Ok(Heard { devices, findings })
 }

@@ -14,7 +14,7 @@ use drivers::{Sample, can, clock};
 use kinematics::{Stamp, Transform};
 use serde::Serialize;
 use sim::wire::{Clockwork, JointTrack, Listeners, PlayedMotors, PlayedSenders, Script, play_fci};
-use std::net::{SocketAddr, ToSocketAddrs};
+use std::net::{SocketAddr, TcpListener, ToSocketAddrs};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -49,6 +49,11 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     let stop = Stop::on_ctrl_c()?;
     let (name, mut rig) = load(&args.what)?;
     check(&rig)?;
+    if rig.arm.driver == ArmDriver::Franka {
+        // Not after a minute of simulating.
+        let address = fci_address(&rig.arm.address)?;
+        TcpListener::bind(address).with_context(|| format!("the controller cannot be played at {address}"))?;
+    }
     let folder = args.out.clone().unwrap_or_else(|| PathBuf::from(format!("sim-{name}")));
     std::fs::create_dir_all(&folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
     let recording = match &args.from {
