@@ -36,7 +36,8 @@ pub struct MovableArmConfig {
 
 /// An arm that is held where it was found, and may be moved.
 ///
-/// Dropping it brings it to rest within its limits; then each motor is told what `on_loss` says.
+/// Dropping it brings it to rest within its limits; then each motor is told what `on_loss` says, those without a watchdog until they
+/// answer.
 #[derive(Debug)]
 pub struct MovableCanArm {
     names: Vec<String>,
