@@ -198,7 +198,7 @@ fn run(command: &mut Command, mut hears: impl FnMut(&mut Child, &str)) -> String
     let guard = std::thread::spawn(move || {
         if is_done.recv_timeout(MAX_RUN) == Err(RecvTimeoutError::Timeout) {
             // The machine's processes are one group: none of them is left.
-            let _ = Command::new("sh").args(["-c", &format!("kill -KILL -- {group}")]).status();
+            let _ = Command::new("sh").args(["-c", &format!("kill -KILL {group}")]).status();
         }
     });
     let mut console = String::new();
