@@ -294,14 +294,13 @@ fn usb(camera: &v4l2::Found) -> Option<Finding> {
 /// V4L2 cameras of a rig that are not plugged in.
 #[cfg(target_os = "linux")]
 fn missing_v4l2(rig: &Rig) -> Vec<Finding> {
-    let of_camera = |camera: &Camera| {
-        let depth = camera.depth.as_ref().map(|depth| depth.device.clone());
-        [Some(camera.device.clone()), depth].into_iter().flatten().map(|device| (camera.name.clone(), device)).collect()
-    };
     let cameras = rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::V4l2);
-    let devices = cameras.flat_map(|camera| -> Vec<_> { of_camera(camera) });
+    let devices = cameras.flat_map(|camera| {
+        let depth = camera.depth.as_ref().map(|depth| &depth.device);
+        std::iter::once(&camera.device).chain(depth).map(move |device| (&camera.name, device))
+    });
     let missing = devices.filter_map(|(name, device)| {
-        let problem = v4l2::look_for(&device).err()?;
+        let problem = v4l2::look_for(device).err()?;
         Some(Finding::fail("cameras", format!("camera {name:?}: {problem}"), "plug it in, or name another one"))
     });
     missing.collect()

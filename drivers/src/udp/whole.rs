@@ -73,6 +73,7 @@ impl WholeReadings {
                 return None;
             }
         };
+        senders.note(device, arrived.from);
         match order.place(head.seq, arrived.at) {
             Place::New { n_lost } => tell(device, &mut counts.n_lost, n_lost, format_args!("{plural} did not come")),
             Place::Restart => tell(device, &mut counts.n_restarts, 1, "the sender counts anew"),
@@ -84,7 +85,6 @@ impl WholeReadings {
         let n_before = order.n_clock_restarts();
         let stamp = order.stamp(&head, arrived.at);
         tell(device, &mut counts.n_clock_restarts, order.n_clock_restarts() - n_before, CLOCK_RESTARTED);
-        senders.note(device, arrived.from);
         if stamp.is_none() {
             let says = head.stamp_nanos;
             let hint = order::hint(&head, arrived.at);
