@@ -551,4 +551,26 @@ mod tests {
         let told = files(&rig);
         assert!(told.len() == 1 && told[0].says.contains("nowhere.bag"), "{told:?}");
     }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn what_opening_would_refuse_is_told_without_opening_it() {
+        let rig = |name: &str, overrides: &[(&'static str, &'static str)]| {
+            let overrides: Vec<_> =
+                overrides.iter().map(|(key, value)| crate::config::Override::new(key, *value)).collect();
+            let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs").join(name);
+            Rig::load(&path, &overrides).expect("a rig file that comes along")
+        };
+        let absent =
+            rig("static-arm.toml", &[("camera.wrist.driver", "v4l2"), ("camera.wrist.device", "no such serial")]);
+        let told = missing_v4l2(&absent);
+        assert!(told.iter().any(|finding| finding.says.contains("\"no such serial\"")), "{told:?}");
+        let told = senders(&rig("static-arm.toml", &[("arm.driver", "udp"), ("arm.address", "localhost")]));
+        assert!(told.len() == 1 && told[0].says.contains("arm.address is \"localhost\""), "{told:?}");
+        assert_eq!(motion(&rig("static-arm.toml", &[])), None, "nothing is moved");
+        for (on_loss, verdict) in [("hold", Verdict::Ok), ("release", Verdict::Fail)] {
+            let told = motion(&rig("wire/static-arm.toml", &[("arm.motion.on_loss", on_loss)])).expect("it is moved");
+            assert_eq!(told.verdict, verdict, "{told:?}");
+        }
+    }
 }
