@@ -1,16 +1,19 @@
 # The same commands by hand and in continuous integration; `make` alone lists them.
 #
-# Every target installs what it misses (system packages with apt when run as root, the pinned MuJoCo library,
-# the page's npm packages) and says so; without root it prints the one line to run.
+# Every target installs missing dependencies (system packages with apt when run as root, the pinned MuJoCo library,
+# the page's npm packages) and prints which; without root it prints the one line to run.
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test hil check fuzz deps web cargo packages nokhwa-packages hil-packages mujoco realsense open-ends
+.PHONY: help demo test hil check fuzz deps web cargo packages test-packages check-packages mujoco realsense open-ends
+# Cargo and npm use all processors; two runs of apt would lock each other out.
+.NOTPARALLEL:
 
 # One feature set everywhere, so that dependencies compile once.
 FEATURES := --features sim
 
 # Tests have webcams by nokhwa beside that, and RealSense cameras where there is a library for them: see `realsense`.
-TEST_FEATURES = $(FEATURES),nokhwa$(shell [ -e .deps/realsense/made-of ] && echo ,realsense)
+TEST_FEATURES = $(FEATURES),nokhwa$(shell [ -e .deps/realsense/made-of ] && \
+	scripts/install-packages.sh --check realsense 2>/dev/null && echo ,realsense)
 
 # The rig that `make demo` simulates: a file of the folder rigs.
 RIG ?= static-arm
@@ -24,14 +27,14 @@ demo: deps web ## Simulate a rig (RIG=static-arm, mobile-arm, mobile-base-small,
 	cargo build --release $(FEATURES)
 	target/release/fieldrig run rigs/$(RIG).toml --sim
 
-test: check web hil-packages ## Lints, documentation and every test that needs no device
+test: test-packages check web ## Lints, documentation and every test that needs no device
 	cargo test --workspace $(TEST_FEATURES) --no-fail-fast
 
 hil: cargo packages web ## Check the rig RIG=file.toml on whatever is plugged in: everything is read for LISTEN_SECONDS=20, nothing is moved
 	cargo build --release $(shell pkg-config --exists realsense2 2>/dev/null && echo --features realsense)
 	target/release/fieldrig doctor $(if $(filter file,$(origin RIG)),$(error say which rig: make hil RIG=file.toml),$(RIG)) --listen $(LISTEN_SECONDS)
 
-check: deps nokhwa-packages realsense open-ends ## Format, clippy, documentation, kernels, licences, open ends
+check: check-packages deps realsense open-ends ## Format, clippy, documentation, kernels, licences, open ends
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets $(TEST_FEATURES) -- -D warnings
 	cargo clippy --workspace --exclude sim --all-targets -- -D warnings
@@ -55,25 +58,26 @@ web: cargo packages ## Build the web page that the binary embeds
 	scripts/build-web.sh
 
 cargo:
-	@command -v cargo >/dev/null 2>&1 || { echo "cargo is missing; run this line, then try again:" >&2; \
-	echo "    curl --proto '=https' --tlsv1.2 -sSf https://sh.rustup.rs | sh" >&2; exit 1; }
+	@scripts/check-cargo.sh
 
 packages:
 	@scripts/install-packages.sh build gpu sim web
 
-nokhwa-packages: packages
-	@scripts/install-packages.sh nokhwa
+# Everything at once, so that there is one line to run without root. Tests whose packages cannot be installed are skipped with a message,
+# unless FIELDRIG_HIL=demand.
+OPTIONAL = $(if $(filter demand,$(FIELDRIG_HIL)),,--optional)
+test-packages: cargo
+	@scripts/install-packages.sh build gpu sim web nokhwa $(OPTIONAL) realsense hil
 
-# Where these cannot be installed the tests in the virtual kernel are skipped with a line, unless FIELDRIG_HIL=demand.
-hil-packages: packages
-	@scripts/install-packages.sh hil || [ "$$FIELDRIG_HIL" != demand ]
+check-packages: cargo
+	@scripts/install-packages.sh build gpu sim web nokhwa $(OPTIONAL) realsense
 
 mujoco: packages
 	@scripts/fetch-mujoco.sh
 
-# Where it cannot be had, what needs it is left out, with a line, unless FIELDRIG_HIL=demand.
-realsense: packages
-	@scripts/install-packages.sh realsense && scripts/fetch-realsense.sh || { [ "$$FIELDRIG_HIL" != demand ] && \
+# Where it is not available, tests that need it are skipped with a message, unless FIELDRIG_HIL=demand.
+realsense: check-packages
+	@scripts/install-packages.sh --check realsense && scripts/fetch-realsense.sh || { [ "$$FIELDRIG_HIL" != demand ] && \
 	echo "skipped: tests of RealSense cameras"; }
 
 open-ends:

@@ -2,8 +2,9 @@
 # Bundles the web page that the binary embeds into viz/web/dist. Needs Node.js 18 or newer with npm.
 set -eu
 cd "$(dirname "$0")/../viz/web"
-if ! command -v npm >/dev/null 2>&1; then
-    echo "the web page needs Node.js 18 or newer with npm; on Debian and Ubuntu run: apt-get install nodejs npm" >&2
+if ! node -e 'process.exit(parseInt(process.versions.node) < 18 ? 1 : 0)' >/dev/null 2>&1 || ! npm --version >/dev/null 2>&1; then
+    echo "build-web: the web page needs Node.js 18 or newer with npm; found $(node --version 2>/dev/null || echo no node)," \
+        "npm $(npm --version 2>/dev/null || echo missing); run: scripts/install-packages.sh web" >&2
     exit 1
 fi
 # Packages are installed again only when the lock file changed.

@@ -1,6 +1,7 @@
 #!/bin/sh
 # Puts the pinned MuJoCo library into .deps/mujoco, out of its wheel on the Python package index.
-# Does nothing when the right library is there already. Needs python3 with pip; installs no Python package.
+# Does nothing when the right library is there already. Needs python3 with pip (any version: the wheel is only unpacked);
+# installs no Python package.
 set -eu
 
 version=3.17.0
@@ -35,8 +36,8 @@ if is_right "$folder/$library"; then
     link_names
     exit 0
 fi
-if ! python3 -m pip --version >/dev/null 2>&1; then
-    echo "fetch-mujoco: pip is missing; run: apt-get install -y python3-pip" >&2
+if ! python3 -c 'import pip, ssl, zipfile' >/dev/null 2>&1; then
+    echo "fetch-mujoco: python3 with pip is missing; run: scripts/install-packages.sh sim" >&2
     exit 1
 fi
 
@@ -44,9 +45,10 @@ echo "fetch-mujoco: downloading the MuJoCo $version wheel"
 mkdir -p "$folder"
 download=$(mktemp -d "$folder/download.XXXXXX")
 trap 'rm -rf "$download"' EXIT
+trap 'exit 130' HUP INT TERM
 if ! python3 -m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: \
     --platform "$platform" --python-version 3.12 -d "$download" "mujoco==$version"; then
-    echo "fetch-mujoco: pip could not download mujoco==$version" >&2
+    echo "fetch-mujoco: pip could not download mujoco==$version: its message is above; is the Python package index reachable?" >&2
     exit 1
 fi
 python3 - "$download" "$library" <<'PYTHON'

@@ -29,8 +29,8 @@ for tool in cc nm patchelf; do
         exit 1
     fi
 done
-if ! python3 -m pip --version >/dev/null 2>&1; then
-    echo "fetch-realsense: pip is missing; run: apt-get install -y python3-pip" >&2
+if ! python3 -c 'import pip, ssl, zipfile' >/dev/null 2>&1; then
+    echo "fetch-realsense: python3 with pip is missing; run: scripts/install-packages.sh realsense" >&2
     exit 1
 fi
 
@@ -38,9 +38,10 @@ echo "fetch-realsense: downloading the wheel $wheel"
 mkdir -p "$folder"
 download=$(mktemp -d "$folder/download.XXXXXX")
 trap 'rm -rf "$download"' EXIT
+trap 'exit 130' HUP INT TERM
 if ! python3 -m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: \
     --platform manylinux1_x86_64 --python-version 3.11 --implementation cp -d "$download" "$wheel"; then
-    echo "fetch-realsense: pip could not download $wheel" >&2
+    echo "fetch-realsense: pip could not download $wheel: its message is above; is the Python package index reachable?" >&2
     exit 1
 fi
 if [ "$(cat "$download"/*.whl | sha256sum | cut -d ' ' -f 1)" != "$sha256" ]; then

@@ -1,21 +1,40 @@
 #!/bin/sh
-# Installs the system packages that are missing, and only those, with apt; says which and why.
-# Without root it prints the one line to run and stops; where a package is there already it does nothing.
+# Installs missing system packages with apt, and only those; prints which and why.
+# Without root it prints the one line to run and fails. Where nothing is missing it does nothing and prints nothing.
+# For Debian 12, Debian 13 and Ubuntu 24.04. scripts/test-install.sh runs it in fresh and half-equipped systems.
 #
-# usage: install-packages.sh GROUP...      groups: build gpu sim web nokhwa realsense hil
+# Each check looks for what a build or a program uses (a header, a library for this processor, a command that runs), not
+# for the name of a package: half a package, another version or another source of the same thing is judged correctly.
+#
+# usage: install-packages.sh [--check] GROUP... [--optional GROUP...]      groups: build gpu sim web nokhwa realsense hil
+#   --check       print what is missing and fail; install nothing
+#   --optional    when packages of the groups after it cannot be installed, print so and succeed
 set -eu
 
+PATH="$PATH:/usr/sbin:/sbin"
+export PATH
+
+# What is missing: package names, and one line of text each. `required` counts those that are not optional.
 missing=""
 reasons=""
+required=0
+is_optional=false
 
-# need PACKAGE REASON: asks for a package unless dpkg knows it as installed.
+# need PACKAGE REASON: asks for a package.
 need() {
-    if [ "$(dpkg-query -W -f '${db:Status-Status}' "$1" 2>/dev/null)" = installed ]; then
-        return
-    fi
+    case "$missing " in
+    *" $1 "*) return 0 ;;
+    esac
     missing="$missing $1"
     reasons="$reasons    $1: $2
 "
+    $is_optional || required=$((required + 1))
+}
+
+# need_package PACKAGE REASON: asks for a package unless dpkg lists it as installed for this processor.
+need_package() {
+    dpkg-query -W -f '${db:Status-Status} ${Architecture}\n' "$1" 2>/dev/null |
+        grep -qxE "installed ($(dpkg --print-architecture)|all)" || need "$1" "$2"
 }
 
 # need_command COMMAND PACKAGE REASON: asks for a package unless the command is on the path, wherever it came from.
@@ -23,92 +42,287 @@ need_command() {
     command -v "$1" >/dev/null 2>&1 || need "$2" "$3"
 }
 
-# need_library LIBRARY PACKAGE REASON: asks for a package unless the dynamic linker finds the library.
-need_library() {
-    PATH="$PATH:/sbin:/usr/sbin" ldconfig -p 2>/dev/null | grep -q "$1 " || need "$2" "$3"
+# need_file FILE PACKAGE REASON: asks for a package unless the file is readable.
+need_file() {
+    [ -r "$1" ] || need "$2" "$3"
 }
 
-for group in "$@"; do
-    case "$group" in
+# elf_machine FILE: word size and processor of a program or library, as in its header; fails for other files.
+elf_machine() {
+    [ "$(head -c 4 "$1" 2>/dev/null | od -An -c | tr -d ' ')" = '177ELF' ] || return 1
+    od -An -tx1 -j4 -N1 "$1"
+    od -An -tx1 -j18 -N2 "$1"
+}
+
+# is_native FILE: whether programs of this system can load a library; one for 32 bits often lies beside the right one.
+is_native() {
+    [ -r "$1" ] && [ "$(elf_machine "$1")" = "$(elf_machine /bin/sh)" ]
+}
+
+# has_library LIBRARY: whether the dynamic linker finds a library for this processor.
+has_library() {
+    for path in $(ldconfig -p 2>/dev/null | awk -v name="$1" '$1 == name { print $NF }'); do
+        ! is_native "$path" || return 0
+    done
+    return 1
+}
+
+need_library() {
+    has_library "$1" || need "$2" "$3"
+}
+
+# links SOURCE [FLAG...]: whether the C compiler makes a program of this source.
+links() {
+    source=$1
+    shift
+    object=$(mktemp)
+    status=0
+    printf '%b' "$source" | cc -x c - -o "$object" "$@" >/dev/null 2>&1 || status=1
+    rm -f "$object"
+    return $status
+}
+
+# need_header HEADER LIBRARY PACKAGE REASON: asks for a package unless programs can be linked with the library. A library
+# without its -dev package has neither the header nor the name that the linker looks for.
+need_header() {
+    if links 'int main(void) { return 0; }\n'; then
+        links "#include <$1>\nint main(void) { return 0; }\n" "-l$2" || need "$3" "$4"
+    else
+        need_package "$3" "$4"
+    fi
+}
+
+# has_lavapipe: whether the Vulkan loader finds Mesa's software driver, for this processor.
+has_lavapipe() {
+    for manifest in /usr/local/share/vulkan/icd.d/lvp_icd*.json /usr/share/vulkan/icd.d/lvp_icd*.json /etc/vulkan/icd.d/lvp_icd*.json; do
+        [ -r "$manifest" ] || continue
+        library=$(sed -n 's/.*"library_path" *: *"\([^"]*\)".*/\1/p' "$manifest")
+        case "$library" in
+        */*) ! is_native "$library" || return 0 ;;
+        *) ! has_library "$library" || return 0 ;;
+        esac
+    done
+    return 1
+}
+
+# python_has CODE: whether python3 is there and runs this.
+python_has() {
+    python3 -c "$1" >/dev/null 2>&1
+}
+
+# need_pip REASON: a pip that knows the platforms of the wheels (manylinux_2_28, since pip 20.3), and the modules that open them.
+need_pip() {
+    python_has 'import pip, ssl, sys, zipfile; sys.exit(int(pip.__version__.split(".")[0]) < 21)' || need python3-pip "$1"
+}
+
+# libclang_files: prints the files that may be libclang where the crate clang-sys looks, in its order: LIBCLANG_PATH alone where
+# that is set, else llvm-config's folder, the linker's paths, the folders of the system.
+libclang_files() {
+    if [ -f "${LIBCLANG_PATH-}" ]; then
+        echo "$LIBCLANG_PATH"
+        return 0
+    fi
+    if [ -n "${LIBCLANG_PATH-}" ]; then
+        set -- "$LIBCLANG_PATH"
+    else
+        prefix=$("${LLVM_CONFIG_PATH:-llvm-config}" --prefix 2>/dev/null || true)
+        # Several words are meant.
+        # shellcheck disable=SC2046
+        set -- ${prefix:+"$prefix/bin" "$prefix/lib" "$prefix/lib64"} \
+            $(echo "${LD_LIBRARY_PATH-}:${LIBRARY_PATH-}" | tr ':' ' ') \
+            /usr/local/llvm*/lib* /usr/local/lib*/*/* /usr/local/lib*/* /usr/local/lib* /usr/lib*/*/* /usr/lib*/* /usr/lib*
+    fi
+    for folder in "$@"; do
+        for file in "$folder"/libclang.so "$folder"/libclang-*.so "$folder"/libclang.so.* "$folder"/libclang-*.so.*; do
+            [ ! -f "$file" ] || echo "$file"
+        done
+    done
+}
+
+# libclangs: prints version (0 where its name has none) and path of each libclang that can be loaded.
+libclangs() {
+    libclang_files | while read -r file; do
+        name=${file##*/}
+        case "$name" in
+        *-cpp.*) continue ;; # Another library: the one with C++ functions.
+        libclang-*) version=${name#libclang-} version=${version%%.so*} ;;
+        libclang.so.*) version=${name#libclang.so.} ;;
+        *) version=0 ;;
+        esac
+        ! is_native "$file" || echo "$version $file"
+    done
+}
+
+# check_libclang: what the crate bindgen needs: libclang, and the headers of the same clang (stddef.h and others).
+check_libclang() {
+    # clang-sys takes the highest version; the order of folders decides among equals.
+    chosen=$(libclangs | sort -s -t ' ' -k 1,1Vr | head -n 1)
+    if [ -z "$chosen" ]; then
+        need libclang-dev "builds the feature nokhwa (bindgen loads libclang)"
+        return 0
+    fi
+    # Where there is a clang command, bindgen takes its search paths.
+    if echo '#include <stddef.h>' | clang -x c -fsyntax-only - >/dev/null 2>&1; then
+        return 0
+    fi
+    library=${chosen#* }
+    real=$(readlink -f "$library")
+    version=$(echo "$library $real" | sed -nE 's#.*libclang-([0-9]+)[.0-9]*\.so.*#\1#p')
+    for folder in "$(dirname "$library")" "$(dirname "$real")" ${version:+"/usr/lib/llvm-$version/lib"} /usr/lib; do
+        for header in "$folder/clang/$version"*/include/stddef.h; do
+            [ ! -r "$header" ] || return 0
+        done
+    done
+    need "libclang${version:+-common-$version}-dev" "headers of clang ${version:+$version }itself, for $library"
+}
+
+# check GROUP: adds what is missing of a group.
+check() {
+    case "$1" in
     build)
-        need_command cc gcc "links Rust programs, compiles the C parts of a few crates"
-        # Without the headers a C compiler is no use; gcc only recommends them.
-        [ -e /usr/include/stdio.h ] || need libc6-dev "headers and start files of the C library"
-        need_command pkg-config pkg-config "how build scripts find libraries"
+        # Without its headers and start files a C compiler is no use; gcc only recommends them.
+        if ! links '#include <stdio.h>\n#include <linux/videodev2.h>\nint main(void) { return puts(""); }\n'; then
+            if echo 'int nothing;' | cc -x c -c -o /dev/null - >/dev/null 2>&1; then
+                need libc6-dev "headers and start files of the C library"
+            else
+                need gcc "links Rust programs, compiles the C parts of a few crates"
+                need_package libc6-dev "headers and start files of the C library"
+            fi
+        fi
+        pkg-config --version >/dev/null 2>&1 || need pkg-config "how build scripts find libraries"
         ;;
     gpu)
         need_library libvulkan.so.1 libvulkan1 "the Vulkan loader"
-        if ! ls /usr/share/vulkan/icd.d/lvp_icd*.json >/dev/null 2>&1; then
-            need mesa-vulkan-drivers "Vulkan in software (lavapipe), used where there is no GPU and by the tests"
-        fi
+        has_lavapipe || need mesa-vulkan-drivers "Vulkan in software (lavapipe), used where there is no GPU and by the tests"
         ;;
     sim)
         need_library libEGL.so.1 libegl1 "rendering without a display"
         need_library libEGL_mesa.so.0 libegl-mesa0 "rendering without a display, in software"
-        need libgl1-mesa-dri "OpenGL in software, for the simulated cameras"
-        if ! python3 -m pip --version >/dev/null 2>&1; then
-            need python3-pip "downloads the MuJoCo wheel"
-        fi
+        need_package libgl1-mesa-dri "OpenGL in software, for the simulated cameras"
+        need_pip "downloads the MuJoCo wheel"
         ;;
     web)
-        need_command node nodejs "bundles the web page"
-        need_command npm npm "fetches what the web page is made of"
+        node -e 'process.exit(parseInt(process.versions.node) < 18 ? 1 : 0)' >/dev/null 2>&1 ||
+            need nodejs "bundles the web page (Node.js 18 or newer)"
+        npm_major=$(npm --version 2>/dev/null | cut -d . -f 1)
+        [ "${npm_major:-0}" -ge 7 ] || need npm "downloads the libraries of the web page (npm 7 or newer)"
         ;;
     nokhwa)
-        # Only Linux needs it: nokhwa's V4L2 is bound anew in each build.
-        ls /usr/lib/llvm-*/lib/libclang*.so* >/dev/null 2>&1 || need libclang-dev "builds the feature nokhwa"
+        # Only Linux needs it: nokhwa's V4L2 bindings are generated in each build.
+        check_libclang
         ;;
     realsense)
         need_library libusb-1.0.so.0 libusb-1.0-0 "how librealsense2 speaks to cameras"
         need_library libudev.so.1 libudev1 "how librealsense2 finds cameras"
-        need_command patchelf patchelf "names the pinned librealsense2 as programs look for it"
-        need_command nm binutils "lists what the pinned librealsense2 wants of Python"
-        if ! python3 -m pip --version >/dev/null 2>&1; then
-            need python3-pip "downloads the RealSense wheel"
-        fi
+        need_command patchelf patchelf "renames the pinned librealsense2 for the linker"
+        need_command nm binutils "lists the Python functions that the pinned librealsense2 imports"
+        need_pip "downloads the RealSense wheel"
         ;;
     hil)
-        # The virtual kernels of tests/hil are built of Debian 12's source; elsewhere its tests are skipped, with a line.
-        if ! grep -q '^VERSION_CODENAME=bookworm$' /etc/os-release 2>/dev/null || [ "$(uname -m)" != x86_64 ]; then
-            continue
+        if ! hil_is_supported; then
+            return 0
         fi
-        need linux-source-6.1 "the kernels that play cameras and CAN buses for the tests"
-        need_command make make "builds it"
-        need_command flex flex "builds it"
-        need_command bison bison "builds it"
-        need_command bc bc "builds it"
-        need_command xz xz-utils "unpacks it"
-        need libelf-dev "builds it"
-        need libssl-dev "builds it"
-        need busybox-static "starts the tests in it"
-        need qemu-system-x86 "plays CAN cards for the tests"
-        need iproute2 "sets these up"
-        need python3-venv "holds the peers of Franka arms"
+        need_file /usr/src/linux-source-6.1.tar.xz linux-source-6.1 "the kernels that play cameras and CAN buses for the tests"
+        need_command make make "builds these kernels"
+        need_command flex flex "builds these kernels"
+        need_command bison bison "builds these kernels"
+        need_command bc bc "builds these kernels"
+        need_command xz xz-utils "unpacks their source"
+        need_header libelf.h elf libelf-dev "builds these kernels"
+        need_header openssl/opensslv.h crypto libssl-dev "builds these kernels"
+        need_package busybox-static "starts the tests in these kernels"
+        need_file /usr/bin/qemu-system-x86_64 qemu-system-x86 "emulates CAN cards for the tests"
+        need_file /usr/sbin/ip iproute2 "sets up the CAN cards"
+        python_has 'import ensurepip, venv' || need python3-venv "holds the other ends of Franka arms for the tests"
         ;;
     *)
-        echo "install-packages: unknown group $group (build, gpu, sim, web, nokhwa, realsense, hil)" >&2
+        echo "install-packages: unknown group $1 (build, gpu, sim, web, nokhwa, realsense, hil)" >&2
         exit 2
         ;;
     esac
-done
+}
 
+# The virtual kernels of tests/hil are built from Debian 12's kernel source.
+hil_is_supported() {
+    grep -q '^VERSION_CODENAME=bookworm$' /etc/os-release 2>/dev/null && [ "$(uname -m)" = x86_64 ]
+}
+
+# check_all: fills `missing`, `reasons` and `required` for all groups named.
+check_all() {
+    missing="" reasons="" required=0 is_optional=false
+    for group in $groups; do
+        case "$group" in
+        --optional) is_optional=true ;;
+        *) check "$group" ;;
+        esac
+    done
+}
+
+# give_up: ends without having installed everything; that is a failure unless only optional groups lack something.
+give_up() {
+    if [ "$required" -eq 0 ]; then
+        echo "continuing without them: the tests that use them are skipped" >&2
+        exit 0
+    fi
+    exit 1
+}
+
+only_check=false
+if [ "${1-}" = --check ]; then
+    only_check=true
+    shift
+fi
+groups=$*
+check_all
+case " $groups " in
+*" hil "*)
+    hil_is_supported || $only_check ||
+        echo "skipping the tests in virtual kernels: these are built from the source of Debian 12's kernel, on x86-64 only" >&2
+    ;;
+esac
 if [ -z "$missing" ]; then
     exit 0
 fi
-# The list is words by design: shellcheck's quoting rule does not apply to $missing below.
-line="apt-get update && apt-get install -y --no-install-recommends$missing"
 printf 'missing system packages:\n%s' "$reasons" >&2
-if ! command -v apt-get >/dev/null 2>&1; then
-    echo "this system has no apt-get: install what these Debian packages hold with its own package manager" >&2
+if $only_check; then
     exit 1
+fi
+if ! command -v apt-get >/dev/null 2>&1; then
+    echo "this system has no apt-get: install the equivalents of these Debian packages with its own package manager" >&2
+    give_up
+fi
+# A lock that another apt holds is waited for.
+install="apt-get install -y -q --no-install-recommends -o DPkg::Lock::Timeout=300"
+# Lists of an unreachable repository do not stop the installation.
+line="apt-get update -q; $install$missing"
+# An installation that was interrupted has to be finished first, together with what it depends on.
+if [ -n "$(dpkg --audit 2>/dev/null)" ]; then
+    line="dpkg --configure -a; apt-get update -q; $install --fix-broken --no-remove; $install$missing"
 fi
 if [ "$(id -u)" -ne 0 ]; then
     echo "not running as root; run this line, then try again:" >&2
-    echo "    sudo sh -c '$line'" >&2
-    exit 1
+    if command -v sudo >/dev/null 2>&1; then
+        echo "    sudo sh -c '$line'" >&2
+    else
+        echo "    su - -c '$line'" >&2
+    fi
+    give_up
 fi
 echo "installing:$missing" >&2
 export DEBIAN_FRONTEND=noninteractive
-apt-get update -q
-# shellcheck disable=SC2086
-apt-get install -y -q --no-install-recommends $missing
+wanted=$missing
+if ! sh -c "$line" >&2; then
+    echo "apt-get did not install all of$wanted; its message is above" >&2
+    give_up
+fi
+hash -r
+check_all
+if [ -n "$missing" ]; then
+    # Most often another copy comes first on the path, such as an old Node.js in /usr/local or a Python without pip.
+    printf 'installed, but still not usable:\n%s' "$reasons" >&2
+    for command in cc pkg-config python3 node npm; do
+        echo "    $command is $(command -v $command || echo not found)" >&2
+    done
+    echo "put /usr/bin first on the path, or repair these packages with: apt-get install --reinstall$missing" >&2
+    give_up
+fi

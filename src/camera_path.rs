@@ -80,7 +80,7 @@ impl CameraPath {
 }
 
 /// The rigid motion of a 4x4 matrix, row major.
-fn rigid(numbers: &[f64]) -> anyhow::Result<Transform> {
+pub(crate) fn rigid(numbers: &[f64]) -> anyhow::Result<Transform> {
     /// Files round to six digits or so.
     const ABS: f64 = 1e-3;
     ensure!(numbers.len() == 16, "a pose has 16 numbers, got {}", numbers.len());

@@ -1,20 +1,42 @@
 //! Checkpoints of a model in training: taken every so often, written on a thread of their own.
 
+use crate::kept_keyframes::KeptKeyframes;
 use crate::run_folder::{CHECKPOINT, expect_one_model};
 use anyhow::Context;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
-use trainer::Method;
 use trainer::checkpoint::{Checkpoint, PendingCheckpoint};
+use trainer::{Keyframe, Method};
+
+/// Time between two checkpoints where no flag says.
+const DEFAULT_PERIOD: Duration = Duration::from_secs(60);
+/// Time after which new keyframes of a live run are written.
+const KEYFRAME_PERIOD: Duration = Duration::from_secs(2);
+/// The flag in a checkpoint.
+const CHECKPOINT_SECS: &str = "checkpoint-secs";
 
 /// How often checkpoints are written.
 #[derive(Clone, Copy, Debug, clap::Args)]
 pub(crate) struct CheckpointArgs {
-    /// Write all that training needs to go on every S seconds and at the end, for `train --resume`; 0: never
-    #[arg(long, value_name = "S", default_value = "60", value_parser = secs)]
-    checkpoint_secs: Duration,
+    /// Write all that training needs to go on every S seconds and at the end, for `--resume`; 0: never [default: 60]
+    #[arg(long, value_name = "S", value_parser = secs)]
+    checkpoint_secs: Option<Duration>,
+}
+
+impl CheckpointArgs {
+    /// The flag as a resumed run finds it in the checkpoint, if it is given.
+    pub(crate) fn flag(self) -> Option<(String, String)> {
+        Some((CHECKPOINT_SECS.to_owned(), self.checkpoint_secs?.as_secs_f64().to_string()))
+    }
+
+    /// This flag, or where it is not given the one of the run that is resumed.
+    pub(crate) fn or_earlier(self, flags: &BTreeMap<String, String>) -> Self {
+        let earlier = || flags.get(CHECKPOINT_SECS).and_then(|text| secs(text).ok());
+        Self { checkpoint_secs: self.checkpoint_secs.or_else(earlier) }
+    }
 }
 
 fn secs(text: &str) -> Result<Duration, String> {
@@ -28,84 +50,166 @@ pub(crate) fn read(folder: &Path) -> anyhow::Result<Checkpoint> {
     Checkpoint::read(&folder.join(CHECKPOINT)).with_context(|| format!("nothing to go on from in {}", folder.display()))
 }
 
-/// What checkpoints say of the data.
+/// What every checkpoint of a run says beside the state of its model.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct OfData {
+pub(crate) struct RunFlags {
     /// SHA-256 of the model that depth was drawn from.
     pub(crate) depth_from: Option<String>,
-    /// Flags that keyframes were made by.
+    /// Flags of the run: those that keyframes were made by, and where training ends.
     pub(crate) flags: BTreeMap<String, String>,
 }
 
 /// The checkpoints of one run; each replaces the one before.
 pub(crate) struct Checkpoints {
     path: PathBuf,
-    of_data: OfData,
+    run_flags: RunFlags,
     every: Duration,
     last: Instant,
-    writing: Option<JoinHandle<Result<(), trainer::Error>>>,
+    /// Where keyframes are kept that no data on disk holds.
+    kept_keyframes: Option<KeptKeyframes>,
+    last_keyframes: Instant,
+    writing: Option<Writing>,
+    /// Whether this run has written one.
+    has_any: bool,
+}
+
+/// What a thread writes.
+struct Writing {
+    thread: JoinHandle<anyhow::Result<()>>,
+    /// Whether it is a checkpoint, not keyframes alone.
+    is_checkpoint: bool,
+}
+
+/// A model in training as a checkpoint takes it.
+pub(crate) struct Snapshot<'a> {
+    pub(crate) method: &'a mut dyn Method,
+    /// Those it holds, for testing too.
+    pub(crate) keyframes: &'a [Arc<Keyframe>],
+    /// Seconds of training.
+    pub(crate) seconds: f64,
+    /// Whether training reached its end.
+    pub(crate) is_finished: bool,
 }
 
 impl Checkpoints {
     /// None where they are not wanted. The first is due after the time between two.
     pub(crate) fn new(folder: &Path, args: CheckpointArgs) -> Option<Self> {
-        let (every, path) = (args.checkpoint_secs, folder.join(CHECKPOINT));
+        let (every, path) = (args.checkpoint_secs.unwrap_or(DEFAULT_PERIOD), folder.join(CHECKPOINT));
         (!every.is_zero()).then(|| Self {
             path,
-            of_data: OfData::default(),
+            run_flags: RunFlags::default(),
             every,
             last: Instant::now(),
+            kept_keyframes: None,
+            last_keyframes: Instant::now(),
             writing: None,
+            has_any: false,
         })
     }
 
-    /// Says this in each.
-    pub(crate) fn with_data(self, of_data: OfData) -> Self {
-        Self { of_data, ..self }
+    /// Writes these into each.
+    pub(crate) fn with_flags(self, run_flags: RunFlags) -> Self {
+        Self { run_flags, ..self }
+    }
+
+    /// Keeps the keyframes too: for a live run, whose images are nowhere else.
+    pub(crate) fn with_keyframes(self, run: &Path) -> Self {
+        Self { kept_keyframes: Some(KeptKeyframes::of_run(run)), ..self }
     }
 
     /// Begins one when it is due and the one before is written, and says so. A disk that refuses one does not stop training.
-    pub(crate) fn when_due(&mut self, method: &mut dyn Method, seconds: f64) -> Result<bool, trainer::Error> {
-        if self.last.elapsed() < self.every || self.writing.as_ref().is_some_and(|thread| !thread.is_finished()) {
+    pub(crate) fn when_due(&mut self, now: Snapshot<'_>) -> Result<bool, trainer::Error> {
+        if self.writing.as_ref().is_some_and(|writing| !writing.thread.is_finished()) {
             return Ok(false);
         }
-        if let Err(error) = self.wait() {
-            log::warn!("no checkpoint, training goes on: {error:#}");
+        if self.last.elapsed() >= self.every {
+            self.begin(now)?;
+            return Ok(true);
         }
-        self.begin(method, seconds)?;
-        Ok(true)
+        if let Some(kept) = self.kept_keyframes.clone().filter(|_| self.last_keyframes.elapsed() >= KEYFRAME_PERIOD) {
+            self.wait_and_warn();
+            let keyframes = now.keyframes.to_vec();
+            let thread = std::thread::spawn(move || kept.add(&keyframes));
+            self.writing = Some(Writing { thread, is_checkpoint: false });
+            self.last_keyframes = Instant::now();
+        }
+        Ok(false)
     }
 
-    /// Begins one of the state as it is now, after the one under way.
-    pub(crate) fn begin(&mut self, method: &mut dyn Method, seconds: f64) -> Result<(), trainer::Error> {
-        if let Err(error) = self.wait() {
-            log::warn!("no checkpoint: {error:#}");
-        }
+    /// Begins one of the current state, after the one under way.
+    pub(crate) fn begin(&mut self, now: Snapshot<'_>) -> Result<(), trainer::Error> {
+        self.wait_and_warn();
         let asked = Instant::now();
-        let pending = method.checkpoint()?;
+        let pending = now.method.checkpoint()?;
         log::debug!("a checkpoint held training up for {:?}", asked.elapsed());
-        let (path, of_data) = (self.path.clone(), self.of_data.clone());
-        self.writing = Some(std::thread::spawn(move || write(pending, seconds, of_data, &path)));
-        self.last = Instant::now();
+        let job = Job {
+            pending,
+            seconds: now.seconds,
+            is_finished: now.is_finished,
+            run_flags: self.run_flags.clone(),
+            path: self.path.clone(),
+            keyframes: self.kept_keyframes.clone().map(|kept| (kept, now.keyframes.to_vec())),
+        };
+        let thread = std::thread::spawn(move || job.write());
+        self.writing = Some(Writing { thread, is_checkpoint: true });
+        (self.last, self.last_keyframes) = (Instant::now(), Instant::now());
         Ok(())
+    }
+
+    fn wait_and_warn(&mut self) {
+        if let Err(error) = self.wait() {
+            log::warn!("no checkpoint, the one before stays: {error:#}");
+        }
+    }
+
+    /// Where the newest one that this run has written lies. One under way that cannot be written any more is given up.
+    pub(crate) fn newest(&mut self) -> Option<&Path> {
+        if let Err(error) = self.wait() {
+            log::debug!("a checkpoint was under way: {error:#}");
+        }
+        self.has_any.then_some(&self.path)
     }
 
     /// Waits until the one under way is on the disk.
     pub(crate) fn wait(&mut self) -> anyhow::Result<()> {
-        let Some(thread) = self.writing.take() else { return Ok(()) };
+        let Some(Writing { thread, is_checkpoint }) = self.writing.take() else { return Ok(()) };
         match thread.join() {
-            Ok(written) => Ok(written?),
+            Ok(written) => {
+                written?;
+                self.has_any |= is_checkpoint;
+                Ok(())
+            }
             Err(panic) => std::panic::resume_unwind(panic),
         }
     }
 }
 
-fn write(pending: PendingCheckpoint, seconds: f64, of_data: OfData, path: &Path) -> Result<(), trainer::Error> {
-    let begun = Instant::now();
-    let OfData { depth_from, flags: data_flags } = of_data;
-    Checkpoint { seconds, depth_from, data_flags, ..pending.finish()? }.write(path)?;
-    log::debug!("a checkpoint was written in {:?}", begun.elapsed());
-    Ok(())
+/// A checkpoint on its way to the disk.
+struct Job {
+    pending: PendingCheckpoint,
+    seconds: f64,
+    is_finished: bool,
+    run_flags: RunFlags,
+    path: PathBuf,
+    keyframes: Option<(KeptKeyframes, Vec<Arc<Keyframe>>)>,
+}
+
+impl Job {
+    /// Writes the keyframes that the checkpoint needs before it, and removes those that only the one before needed after it.
+    fn write(self) -> anyhow::Result<()> {
+        let begun = Instant::now();
+        let RunFlags { depth_from, flags } = self.run_flags;
+        if let Some((kept, keyframes)) = &self.keyframes {
+            kept.add(keyframes)?;
+        }
+        let (seconds, is_finished) = (self.seconds, self.is_finished);
+        Checkpoint { seconds, is_finished, depth_from, flags, ..self.pending.finish()? }.write(&self.path)?;
+        if let Some((kept, keyframes)) = &self.keyframes {
+            kept.keep_only(keyframes)?;
+        }
+        log::debug!("a checkpoint was written in {:?}", begun.elapsed());
+        Ok(())
+    }
 }
 
 #[cfg(test)]
@@ -119,6 +223,16 @@ mod tests {
         for wrong in ["-1", "nan", "inf", "minute", ""] {
             assert!(secs(wrong).is_err(), "{wrong}");
         }
+    }
+
+    #[test]
+    fn a_resumed_run_keeps_the_period_unless_another_is_given() {
+        let [none, one, two] = [None, Some(1.0), Some(2.5)]
+            .map(|secs| CheckpointArgs { checkpoint_secs: secs.map(Duration::from_secs_f64) });
+        let flags = |args: CheckpointArgs| args.flag().into_iter().collect();
+        assert_eq!(none.or_earlier(&flags(two)).checkpoint_secs, two.checkpoint_secs);
+        assert_eq!(one.or_earlier(&flags(two)).checkpoint_secs, one.checkpoint_secs);
+        assert_eq!(none.or_earlier(&flags(none)).checkpoint_secs, None);
     }
 
     #[test]

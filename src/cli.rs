@@ -1,6 +1,8 @@
 //! The commands and what `--help` says of them; each command's flags stand at the head of its own file.
 
-use crate::commands::{bench, devices, doctor, eval, export, fk, metrics, move_arm, record, render, run, sim, train};
+use crate::commands::{
+    bench, devices, doctor, eval, export, fk, metrics, move_arm, record, render, run, sim, train, view,
+};
 use clap::{ArgAction, Parser, Subcommand};
 
 /// Turns a robot's cameras and joints into a live radiance field.
@@ -13,7 +15,8 @@ use clap::{ArgAction, Parser, Subcommand};
     after_help = "Results go to stdout, log and progress to stderr.\n\
                   Exit codes: 0 done, 1 failed, 2 bad arguments, 3 done with loss, 4 refused for lack of evidence.\n\
                   A loss is data that came, or should have come, and is not in the result: images that devices lost or that \
-                  do not decode, recordings cut off. Each is named on stderr and, by train and run, in report.json."
+                  do not decode, recordings cut off. Each is named on stderr and, by train and run, in report.json. \
+                  Output lines that could not be written count, too."
 )]
 pub(crate) struct Cli {
     /// Say more on stderr; twice for everything
@@ -32,6 +35,8 @@ pub(crate) enum Command {
     Record(record::Args),
     /// Train a scene model on a dataset folder or a recording
     Train(train::Args),
+    /// Show a saved model or a file of splats in the browser
+    View(view::Args),
     /// Draw pictures from a saved model
     Render(render::Args),
     /// Score a saved model on test images

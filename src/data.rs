@@ -57,6 +57,13 @@ impl DataArgs {
         given.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?))).collect()
     }
 
+    /// The flags that make the pixels of listed keyframes what they were, as words of a command line.
+    pub(crate) fn flags_of_images(&self) -> Vec<String> {
+        let rig = self.rig.as_ref().map(|file| ["--rig".to_owned(), file.display().to_string()]);
+        let scale = self.scale.map(|scale| ["--scale".to_owned(), scale.to_string()]);
+        rig.into_iter().chain(scale).flatten().collect()
+    }
+
     /// These flags, and where they say nothing those that keyframes were made by `before`. A number that says otherwise is refused;
     /// a file may have moved: what it makes has to be the same, and is compared later.
     ///
@@ -223,6 +230,12 @@ impl Data {
     /// Keyframes of one split.
     pub(crate) fn of_split(&self, split: Split) -> Vec<Arc<Keyframe>> {
         self.keyframes.iter().filter(|keyframe| keyframe.split == split).cloned().collect()
+    }
+
+    /// Names of the images by camera and stamp.
+    pub(crate) fn image_names(&self) -> BTreeMap<(String, i64), String> {
+        let key = |keyframe: &Arc<Keyframe>| (keyframe.camera.to_string(), keyframe.stamp.0);
+        self.keyframes.iter().map(key).zip(self.names.iter().cloned()).collect()
     }
 
     /// Whether any keyframe has depth.

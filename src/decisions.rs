@@ -71,6 +71,13 @@ impl Settings {
     }
 }
 
+impl Settings {
+    /// The settings of a run that continues from a checkpoint of this many updates, or begins anew.
+    pub(crate) fn after(&self, from_step: Option<u64>) -> Self {
+        Self { from_step, ..self.clone() }
+    }
+}
+
 /// One decision, once so many updates had been made.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Entry {

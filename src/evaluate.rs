@@ -59,9 +59,9 @@ pub(crate) struct ImageScores {
     /// dB of the delivered image against the noise-free one; in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) psnr_ceiling: Option<f64>,
-    /// Share of its pixels that the model covers.
+    /// Share of its pixels that the model covers; `None` where the picture stayed on the GPU.
     #[serde(skip)]
-    pub(crate) seen_frac: f64,
+    pub(crate) seen_frac: Option<f64>,
 }
 
 /// Means over the test images. `None` is not known, never zero.
@@ -99,7 +99,25 @@ impl Evaluator {
 
     /// Scores one test keyframe.
     pub(crate) fn score(&self, method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<ImageScores> {
-        let drawn = draw(method, keyframe)?;
+        if !self.all
+            && self.lpips.is_none()
+            && let Some(psnr) = psnr_on_gpu(method, keyframe)?
+        {
+            return Ok(ImageScores {
+                camera: keyframe.camera.to_string(),
+                stamp_nanos: keyframe.stamp.0,
+                psnr,
+                ssim: None,
+                lpips: None,
+                depth_rmse_m: None,
+                surface_error_m: None,
+                surface_within_5_mm: None,
+                psnr_truth: None,
+                psnr_ceiling: keyframe.truth.as_ref().and_then(|truth| truth.psnr_ceiling),
+                seen_frac: None,
+            });
+        }
+        let drawn = draw(method, keyframe, false)?;
         let pair = PixelPair::new(keyframe.size_px, &drawn.rgba_srgb, &keyframe.rgba_srgb)?;
         let depth = if self.all { depth_error(method, keyframe)? } else { DepthError::default() };
         Ok(ImageScores {
@@ -113,8 +131,14 @@ impl Evaluator {
             surface_within_5_mm: depth.surface.map(|surface| surface.near_frac),
             psnr_truth: if self.all { truth_score(method, keyframe)? } else { None },
             psnr_ceiling: keyframe.truth.as_ref().and_then(|truth| truth.psnr_ceiling),
-            seen_frac: seen_frac(&drawn),
+            seen_frac: Some(seen_frac(&drawn)),
         })
+    }
+
+    /// Scores one test keyframe; an error names it.
+    pub(crate) fn score_named(&self, method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<ImageScores> {
+        self.score(method, keyframe)
+            .with_context(|| format!("test image of {:?} at {} ns", keyframe.camera, keyframe.stamp.0))
     }
 
     /// Scores test keyframes one after the other.
@@ -123,12 +147,7 @@ impl Evaluator {
         method: &mut dyn Method,
         tests: impl Iterator<Item = &'a Arc<Keyframe>>,
     ) -> anyhow::Result<Vec<ImageScores>> {
-        tests
-            .map(|keyframe| {
-                self.score(method, keyframe)
-                    .with_context(|| format!("test image of {:?} at {} ns", keyframe.camera, keyframe.stamp.0))
-            })
-            .collect()
+        tests.map(|keyframe| self.score_named(method, keyframe)).collect()
     }
 }
 
@@ -202,9 +221,9 @@ fn mean(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
 }
 
 /// The picture a model shows where a keyframe was taken, sheared as the keyframe is.
-pub(crate) fn draw(method: &mut dyn Method, keyframe: &Keyframe) -> Result<Picture, trainer::Error> {
+pub(crate) fn draw(method: &mut dyn Method, keyframe: &Keyframe, depth: bool) -> Result<Picture, trainer::Error> {
     let lens = method.posed_lens(keyframe)?;
-    let mut picture = method.render(&request(keyframe, &lens))?;
+    let mut picture = method.render(&RenderRequest { depth, ..request(keyframe, &lens) })?;
     if lens.gains != [1.0; 3] {
         let by_byte = lens.gains.map(exposed);
         for [red, green, blue, _] in picture.rgba_srgb.as_chunks_mut::<4>().0 {
@@ -214,6 +233,13 @@ pub(crate) fn draw(method: &mut dyn Method, keyframe: &Keyframe) -> Result<Pictu
         }
     }
     Ok(picture)
+}
+
+/// PSNR of the picture that [`draw`] draws against the image of the keyframe, without reading the picture back: equal to the
+/// last bit. `None` where the method cannot do that, or the picture is brightened after it was drawn.
+fn psnr_on_gpu(method: &mut dyn Method, keyframe: &Keyframe) -> Result<Option<f64>, trainer::Error> {
+    let lens = method.posed_lens(keyframe)?;
+    if lens.gains == [1.0; 3] { method.psnr(&request(keyframe, &lens), keyframe) } else { Ok(None) }
 }
 
 /// The picture a model shows where a keyframe's depth was taken, of the size and lens of `depth`: the keyframe's, or every so manieth
@@ -230,6 +256,7 @@ pub(crate) fn draw_depth(
         size_px: depth.size_px,
         projection: Projection::Pinhole { focal_px: depth.focal_px, principal_px: depth.principal_px },
         shutter: None,
+        depth: true,
         ..request(keyframe, &lens)
     })?;
     Ok(Some(drawn))
@@ -252,6 +279,7 @@ fn request(keyframe: &Keyframe, lens: &PosedLens) -> RenderRequest {
         crop: None,
         background_srgb: [0.0; 3],
         light_of: Some((keyframe.camera.clone(), keyframe.stamp)),
+        depth: false,
     }
 }
 
@@ -299,7 +327,7 @@ mod tests {
             surface_within_5_mm: None,
             psnr_truth: None,
             psnr_ceiling: None,
-            seen_frac: 1.0,
+            seen_frac: Some(1.0),
         }
     }
 

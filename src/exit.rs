@@ -1,6 +1,7 @@
 //! Exit codes, and which error means which.
 
 use crate::config::ConfigError;
+use crate::print;
 use std::io::ErrorKind;
 use std::process::ExitCode;
 
@@ -18,6 +19,13 @@ pub(crate) enum Exit {
     Loss = 3,
     /// Not done: what came in does not suffice.
     Refused = 4,
+}
+
+impl Exit {
+    /// A command that made its result but could not print all about it ends with a loss.
+    pub(crate) fn or_lost_output(self) -> Self {
+        if self == Self::Done && print::lost_output() { Self::Loss } else { self }
+    }
 }
 
 impl From<Exit> for ExitCode {
@@ -58,7 +66,12 @@ pub(crate) fn after(losses: &[String]) -> Exit {
     if losses.is_empty() { Exit::Done } else { Exit::Loss }
 }
 
-/// Whether whoever read our output went away, as `head` does.
+/// Whether a file could not be written or read, as on a full disk.
+pub(crate) fn is_io(error: &anyhow::Error) -> bool {
+    error.chain().any(|cause| cause.is::<std::io::Error>())
+}
+
+/// Whether whoever read our output went away, as `head` does: the end of a command whose result is its output.
 pub(crate) fn is_broken_pipe(error: &anyhow::Error) -> bool {
     let is_pipe = |io: &std::io::Error| io.kind() == ErrorKind::BrokenPipe;
     error.downcast_ref::<crate::print::StdoutError>().is_some_and(|error| is_pipe(&error.0))

@@ -1,6 +1,7 @@
 //! Keyframes -> a nerfstudio folder: PNG colour, 16-bit depth, poses, split lists.
 
-use anyhow::{Context, ensure};
+use crate::partial::Partial;
+use anyhow::{Context, bail, ensure};
 use drivers::dataset::nerfstudio;
 use image::ExtendedColorType;
 use kinematics::{Transform, transform};
@@ -19,6 +20,12 @@ const TEST_LIST: &str = "test.txt";
 const LISTS: [(&str, Split); 3] =
     [("train_filenames", Split::Train), ("val_filenames", Split::Selection), ("test_filenames", Split::Test)];
 
+/// What a dataset's folder holds.
+const ENTRIES: [&str; 5] = [IMAGES, MASKS, DEPTH, TEST_LIST, nerfstudio::FILE_NAME];
+const IMAGES: &str = "images";
+const MASKS: &str = "masks";
+const DEPTH: &str = "depth";
+
 /// What was written.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Written {
@@ -33,7 +40,10 @@ pub(crate) struct Written {
 /// Depth is rounded to millimetres and ends at 65 m. Velocities, readout times and the truth of simulators have no place in it.
 pub(crate) fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<Keyframe>>) -> anyhow::Result<Written> {
     let transforms = out.join(nerfstudio::FILE_NAME);
-    ensure!(!transforms.exists(), "{} is there already: name another folder", transforms.display());
+    if let Some(there) = ENTRIES.iter().map(|entry| out.join(entry)).find(|entry| entry.exists()) {
+        bail!("{} is there already: name another folder", there.display());
+    }
+    let partial = Partial::folder(out, &ENTRIES);
     let mut written = Written::default();
     let (mut cameras, mut frames, mut splits) = (Vec::new(), Vec::new(), Vec::new());
     for keyframe in keyframes {
@@ -60,6 +70,7 @@ pub(crate) fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<K
     }
     document.insert("frames".to_owned(), json!(frames));
     write_text(&transforms, &serde_json::to_string_pretty(&document)?)?;
+    partial.keep();
     Ok(written)
 }
 
@@ -68,22 +79,22 @@ fn write_frame(out: &Path, keyframe: &Keyframe, written: &mut Written) -> anyhow
     let name = format!("{}_{:020}.png", keyframe.camera, keyframe.stamp.0);
     let mut frame = Map::new();
     let mut insert = |key: &str, value: Value| frame.insert(key.to_owned(), value);
-    insert("file_path", json!(format!("images/{name}")));
+    insert("file_path", json!(format!("{IMAGES}/{name}")));
     insert("transform_matrix", opengl_rows(&keyframe.world_from_camera));
 
     let pixels = keyframe.rgba_srgb.as_chunks::<4>().0;
     let rgb: Vec<u8> = pixels.iter().flat_map(|&[red, green, blue, _]| [red, green, blue]).collect();
-    write_png(&out.join("images").join(&name), keyframe.size_px, &rgb, ExtendedColorType::Rgb8)?;
+    write_png(&out.join(IMAGES).join(&name), keyframe.size_px, &rgb, ExtendedColorType::Rgb8)?;
     written.n_images += 1;
     if pixels.iter().any(|pixel| pixel[3] == 0) {
         let mask: Vec<u8> = pixels.iter().map(|pixel| pixel[3]).collect();
-        write_png(&out.join("masks").join(&name), keyframe.size_px, &mask, ExtendedColorType::L8)?;
-        insert("mask_path", json!(format!("masks/{name}")));
+        write_png(&out.join(MASKS).join(&name), keyframe.size_px, &mask, ExtendedColorType::L8)?;
+        insert("mask_path", json!(format!("{MASKS}/{name}")));
     }
     match &keyframe.depth {
         Some(depth) if has_lens_of(depth, keyframe) => {
-            write_png(&out.join("depth").join(&name), depth.size_px, &depth_counts(depth), ExtendedColorType::L16)?;
-            insert("depth_file_path", json!(format!("depth/{name}")));
+            write_png(&out.join(DEPTH).join(&name), depth.size_px, &depth_counts(depth), ExtendedColorType::L16)?;
+            insert("depth_file_path", json!(format!("{DEPTH}/{name}")));
             if depth.world_from_camera != keyframe.world_from_camera {
                 insert("depth_transform_matrix", opengl_rows(&depth.world_from_camera));
             }

@@ -5,7 +5,7 @@ use crate::stands::Stands;
 use crate::stop::Stop;
 use anyhow::{Context, anyhow};
 use drivers::recording::Recorder;
-use drivers::{PixelFormat, Sample, Source};
+use drivers::{PixelFormat, Sample, Source, clock};
 use kinematics::Stamp;
 use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -18,6 +18,9 @@ use viz::{Hub, LiveImage, LivePixels};
 
 /// Keyframes that may wait for the trainer. When they do, the source waits too, and live devices drop (and count) images.
 const MAX_WAITING: usize = 8;
+
+/// A live image that seems older than this has a stamp on another clock, such as a simulator's.
+const MAX_LIVE_AGE_SECS: f64 = 60.0;
 
 /// A change of the set of keyframes.
 #[derive(Debug)]
@@ -48,6 +51,8 @@ pub(crate) struct Input {
     /// Where the base walks.
     pub(crate) stands: Option<Stands>,
     pub(crate) recorder: Option<Recorder>,
+    /// Whether devices are read as they run; the stamps of a recording are from another time.
+    pub(crate) is_live: bool,
     /// Focal length and principal point of every camera, pixels.
     pub(crate) lenses: HashMap<Arc<str>, ([f64; 2], [f64; 2])>,
 }
@@ -237,12 +242,24 @@ impl Pump {
         self.hub.set_live_image(LiveImage {
             camera: image.camera.clone(),
             stamp: image.stamp,
+            captured_at: self.captured_at(image.stamp),
             size_px: image.size_px,
             pixels,
             world_from_camera: Some(self.input.stands.as_ref().map_or(seen.world_from_camera, pose)),
             focal_px,
             principal_px,
         });
+    }
+
+    /// When an image was captured. Where its stamp is not on our clock (recordings, simulations), that is the present.
+    fn captured_at(&self, stamp: Stamp) -> Instant {
+        let now = Instant::now();
+        let age_secs = clock::now().secs_since(stamp);
+        if self.input.is_live && (0.0..MAX_LIVE_AGE_SECS).contains(&age_secs) {
+            now.checked_sub(Duration::from_secs_f64(age_secs)).unwrap_or(now)
+        } else {
+            now
+        }
     }
 }
 

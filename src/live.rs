@@ -1,6 +1,8 @@
 //! Models growing while keyframes come in and people look.
 
 use crate::feed::{Change, Feed, Leftover};
+use crate::recovery::{self, Recoveries};
+use crate::render_budget::RenderBudget;
 use crate::scene_hint;
 use crate::session::Session;
 use crate::turns;
@@ -15,8 +17,10 @@ const PUBLISH_EVERY: Duration = Duration::from_millis(250);
 const IDLE: Duration = Duration::from_millis(10);
 /// Share of the time that goes into scores between the marks.
 const SCORE_FRAC: f64 = 0.03;
-/// A slice of training this short still leaves this much to the renders.
-const LEAST_RENDER_TIME: Duration = Duration::from_millis(10);
+/// While it waits for a keyframe or a request for a picture, it looks for keyframes this often.
+const LOOK_EVERY: Duration = Duration::from_millis(2);
+/// Pictures are drawn for this long before anything else gets its turn.
+const MAX_RENDER_TIME: Duration = Duration::from_millis(100);
 
 /// What sets the pace.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -39,12 +43,16 @@ pub(crate) struct Live {
     pace: Pace,
     start_keyframes: usize,
     keyframes: Vec<Arc<Keyframe>>,
+    n_evicted: u64,
     /// Step of each session at which the next keyframe is due in lockstep.
     next_keyframe_at: Vec<u64>,
-    trained: Duration,
+    budget: RenderBudget,
+    /// Session whose newest score is refreshed next.
+    next_refreshed: usize,
     published: Option<Instant>,
     scoring: Duration,
     notes: Vec<String>,
+    recoveries: Recoveries,
 }
 
 impl Live {
@@ -58,15 +66,35 @@ impl Live {
             pace: options.pace,
             start_keyframes: options.start_keyframes,
             keyframes: Vec::new(),
-            trained: Duration::ZERO,
+            n_evicted: 0,
+            budget: RenderBudget::default(),
+            next_refreshed: 0,
             published: None,
             scoring: Duration::ZERO,
             notes: options.notes,
+            recoveries: Recoveries::default(),
         }
+    }
+
+    /// Continues with the keyframes of an earlier run, which the sessions hold already.
+    pub(crate) fn after(mut self, keyframes: Vec<Arc<Keyframe>>) -> Self {
+        self.keyframes = keyframes;
+        self.show_keyframes();
+        if let Some(hint) = scene_hint::from_keyframes(&self.keyframes) {
+            self.hub.set_scene_hint(hint);
+        }
+        self
+    }
+
+    fn show_keyframes(&self) {
+        self.hub.set_keyframes(self.keyframes.iter().map(|keyframe| frustum(keyframe)).collect());
     }
 
     /// Whether a limit was reached or cannot be, the devices failed, or they ended and left nothing to train on.
     pub(crate) fn is_over(&self) -> bool {
+        if self.is_scoring() {
+            return false; // A mark at the limit is reported.
+        }
         // Where one reached its limit, the others are waited for as long as they can reach theirs.
         let is_done = |session: &Session| session.is_over() || (self.feed.ended() && session.is_idle());
         let reached = self.sessions.iter().any(Session::is_over) && self.sessions.iter().all(is_done);
@@ -79,27 +107,68 @@ impl Live {
         self.is_finished() && self.sessions.iter().any(|session| session.steps_missing().is_some_and(|n| n > 0))
     }
 
+    /// Where people look.
+    pub(crate) fn hub(&self) -> Hub {
+        self.hub.clone()
+    }
+
     /// Keyframes held, in order of acceptance.
     pub(crate) fn keyframes(&self) -> &[Arc<Keyframe>] {
         &self.keyframes
     }
 
-    /// Gives new keyframes to the model: all that wait in real time, the one that is due in lockstep.
-    pub(crate) fn take_keyframes(&mut self) -> anyhow::Result<()> {
+    /// Keyframes that made room for others so far: 0 until the store is full.
+    pub(crate) fn n_evicted(&self) -> u64 {
+        self.n_evicted
+    }
+
+    /// The models in training.
+    pub(crate) fn sessions(&self) -> &[Session] {
+        &self.sessions
+    }
+
+    /// Takes keyframes, trains, draws and publishes in turn. Where the GPU fails it is opened again.
+    pub(crate) fn advance(&mut self) -> anyhow::Result<()> {
+        let advanced =
+            self.take_keyframes().and_then(|()| self.step()).and_then(|()| self.render()).and_then(|()| self.publish());
+        advanced.or_else(|error| self.recoveries.recover(&mut self.sessions, error))
+    }
+
+    /// Waits for what is queued. Where the GPU failed it is opened again; says whether that was needed.
+    pub(crate) fn wait(&mut self) -> anyhow::Result<bool> {
+        match self.sessions.iter().try_for_each(Session::wait) {
+            Ok(()) => Ok(false),
+            Err(error) => self.recoveries.recover(&mut self.sessions, error).map(|()| true),
+        }
+    }
+
+    /// What is left on the disk where the run fails now.
+    pub(crate) fn what_is_left(&mut self) -> String {
+        recovery::what_is_left(&mut self.sessions)
+    }
+
+    /// Gives new keyframes to the model: all that wait in real time, the one that is due in lockstep. None while a mark is scored.
+    fn take_keyframes(&mut self) -> anyhow::Result<()> {
+        if self.is_scoring() {
+            return Ok(());
+        }
         if let Some(first_image) = self.feed.first_image() {
             self.sessions.iter_mut().for_each(|session| session.start_clock(first_image));
         }
         let n_before = self.keyframes.len();
         match self.pace {
             Pace::RealTime => {
-                let patience = if self.is_training() && !self.is_idle() { Duration::ZERO } else { IDLE };
-                while let Some(change) = self.feed.next(patience) {
+                if !self.is_training() || self.is_idle() {
+                    let first = self.wait_for_change();
+                    first.map_or(Ok(()), |change| self.apply(change))?;
+                }
+                while let Some(change) = self.feed.next(Duration::ZERO) {
                     self.apply(change)?;
                 }
             }
             Pace::Lockstep { steps_per_keyframe } => {
                 while !self.feed.ended() && self.is_keyframe_due() {
-                    let Some(change) = self.feed.next(IDLE) else { break };
+                    let Some(change) = self.wait_for_change() else { break };
                     let is_new = matches!(change, Change::Accepted(_));
                     self.apply(change)?;
                     if is_new && self.is_training() {
@@ -111,7 +180,7 @@ impl Live {
             }
         }
         if self.keyframes.len() != n_before {
-            self.hub.set_keyframes(self.keyframes.iter().map(|keyframe| frustum(keyframe)).collect());
+            self.show_keyframes();
             if self.keyframes.len() <= self.start_keyframes
                 && let Some(hint) = scene_hint::from_keyframes(&self.keyframes)
             {
@@ -121,16 +190,49 @@ impl Live {
         Ok(())
     }
 
-    /// Trains a slice, once there are keyframes enough.
-    pub(crate) fn step(&mut self) -> anyhow::Result<()> {
-        self.trained = Duration::ZERO;
+    /// The next keyframe that came or went; none where a picture is asked for that may be drawn now, or nothing happens for
+    /// [`IDLE`].
+    fn wait_for_change(&mut self) -> Option<Change> {
+        if self.hub.n_clients() == 0 {
+            return self.feed.next(IDLE);
+        }
+        let begun = Instant::now();
+        loop {
+            let before = Instant::now();
+            let patience = if self.budget.may_render() { Duration::ZERO } else { LOOK_EVERY };
+            if let Some(change) = self.feed.next(patience) {
+                return Some(change);
+            }
+            let is_asked = self.budget.may_render() && self.hub.wait_for_request(LOOK_EVERY);
+            self.budget.add_training(before.elapsed()); // Training did not want this time.
+            if begun.elapsed() >= IDLE || is_asked {
+                return None;
+            }
+        }
+    }
+
+    /// Trains a slice, once there are keyframes enough; scores one test image instead where a mark was reached. Does nothing
+    /// where a picture is asked for that may be drawn at once.
+    fn step(&mut self) -> anyhow::Result<()> {
+        self.sessions.iter().try_for_each(Session::check_gpu)?;
         if !self.is_training() {
             return Ok(());
         }
-        if self.is_finished() {
-            std::thread::sleep(IDLE);
+        if let Some(session) = self.sessions.iter_mut().find(|session| session.is_scoring()) {
+            let before = Instant::now();
+            session.score_next()?;
+            self.budget.add_training(before.elapsed());
             return Ok(());
         }
+        if self.is_finished() {
+            self.hub.wait_for_request(IDLE);
+            return Ok(());
+        }
+        if self.is_awaited() {
+            return Ok(());
+        }
+        let is_watched = self.hub.n_clients() > 0;
+        self.sessions.iter_mut().for_each(|session| session.set_watched(is_watched));
         let is_paced = self.pace != Pace::RealTime && !self.feed.ended();
         let due = &self.next_keyframe_at;
         let n_most = |ix: usize, session: &Session| match is_paced {
@@ -138,16 +240,24 @@ impl Live {
             false => u64::MAX,
         };
         let before = Instant::now();
-        turns::take(&mut self.sessions, n_most)?;
-        self.trained = before.elapsed();
+        let (hub, budget) = (&self.hub, self.budget);
+        turns::take(&mut self.sessions, n_most, || budget.may_render() && hub.wait_for_request(Duration::ZERO))?;
+        self.budget.add_training(before.elapsed());
         Ok(())
     }
 
-    /// Draws what people asked for, for about as long as the last slice of training took.
-    pub(crate) fn render(&mut self) {
-        let before = Instant::now();
-        let budget = self.trained.max(LEAST_RENDER_TIME);
-        while before.elapsed() < budget {
+    /// Whether a picture is asked for that may be drawn now.
+    fn is_awaited(&self) -> bool {
+        self.budget.may_render() && self.hub.wait_for_request(Duration::ZERO)
+    }
+
+    /// Draws what people asked for, as far as that leaves training its share of the time.
+    fn render(&mut self) -> anyhow::Result<()> {
+        let begun = Instant::now();
+        if !self.is_training() || self.is_idle() {
+            self.budget = RenderBudget::default(); // Nobody else wants the time.
+        }
+        while begun.elapsed() < MAX_RENDER_TIME && self.budget.may_render() {
             let Some(pending) = self.hub.next_request() else { break };
             if self.keyframes.is_empty() {
                 pending.fail("nothing was seen yet");
@@ -159,26 +269,38 @@ impl Live {
                 pending.fail(&format!("no model of the method {asked:?} learns here, but {there}"));
                 continue;
             };
+            // What is queued before the picture is training's time.
+            let before = Instant::now();
+            session.n_taken()?;
+            self.budget.add_training(before.elapsed());
+            let before = Instant::now();
             match session.render(&pending.request) {
                 Ok(picture) => pending.deliver(picture),
                 Err(error) => pending.fail(&error.to_string()),
             }
+            self.budget.add_render(before.elapsed());
         }
+        Ok(())
     }
 
     /// Tells whoever looks where the run stands, a few times a second.
-    pub(crate) fn publish(&mut self) -> anyhow::Result<()> {
+    fn publish(&mut self) -> anyhow::Result<()> {
         if self.published.is_some_and(|published| published.elapsed() < PUBLISH_EVERY) {
             return Ok(());
         }
         self.published = Some(Instant::now());
         let clock_secs = self.sessions[0].secs();
-        if self.scoring.as_secs_f64() < SCORE_FRAC * clock_secs {
+        if self.scoring.as_secs_f64() < SCORE_FRAC * clock_secs && !self.is_scoring() {
             let before = Instant::now();
-            for session in self.sessions.iter_mut().filter(|session| session.progress().step > 0) {
+            // One image at a time: people wait meanwhile.
+            self.next_refreshed = (self.next_refreshed + 1) % self.sessions.len();
+            let session = &mut self.sessions[self.next_refreshed];
+            if session.progress().step > 0 {
+                session.n_taken()?;
                 session.refresh_psnr()?;
             }
             self.scoring += before.elapsed();
+            self.budget.add_training(before.elapsed());
         }
         let mut models = self.sessions.iter().map(model_status);
         self.hub.set_status(Status {
@@ -189,22 +311,20 @@ impl Live {
             model: models.next().unwrap_or_default(),
             others: models.collect(),
             notes: self.notes.clone(),
+            ended: None,
         });
         Ok(())
     }
 
     /// Ends the input; the sessions and what is left of the input come back.
     pub(crate) fn finish(self) -> (Vec<Session>, anyhow::Result<Leftover>) {
-        let name =
-            |session: &Session| ModelStatus { method: session.kind().name().to_owned(), ..ModelStatus::default() };
-        let mut models = self.sessions.iter().map(name);
-        self.hub.set_status(Status {
-            state: "saving".to_owned(),
-            model: models.next().unwrap_or_default(),
-            others: models.collect(),
-            ..Status::default()
-        });
+        // The figures stay: the scores are what people wait for.
+        self.hub.set_state("saving");
         (self.sessions, self.feed.finish())
+    }
+
+    fn is_scoring(&self) -> bool {
+        self.sessions.iter().any(Session::is_scoring)
     }
 
     fn is_training(&self) -> bool {
@@ -250,19 +370,24 @@ impl Live {
         match change {
             Change::Accepted(keyframe) => {
                 // Nothing comes to a model that has made all its steps: it is as it would be alone.
+                self.keyframes.push(keyframe.clone());
+                let mut pushed = Ok(());
                 for session in self.sessions.iter_mut().filter(|session| !session.has_all_steps()) {
-                    session.push(&keyframe)?;
+                    // Each holds it, also where a GPU failed: it is there when the model is made again.
+                    pushed = pushed.and(session.push(&keyframe));
                 }
-                self.keyframes.push(keyframe);
+                pushed
             }
             Change::Evicted { camera, stamp } => {
-                for session in self.sessions.iter_mut().filter(|session| !session.has_all_steps()) {
-                    session.remove(&camera, stamp)?;
-                }
+                self.n_evicted += 1;
                 self.keyframes.retain(|keyframe| keyframe.camera != camera || keyframe.stamp != stamp);
+                let mut removed = Ok(());
+                for session in self.sessions.iter_mut().filter(|session| !session.has_all_steps()) {
+                    removed = removed.and(session.remove(&camera, stamp));
+                }
+                removed
             }
         }
-        Ok(())
     }
 }
 

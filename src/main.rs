@@ -1,6 +1,8 @@
 //! The `fieldrig` command: parse, run, exit code.
 
+mod allocator;
 mod bench;
+mod camera_list;
 mod camera_path;
 mod chart;
 mod checkpoints;
@@ -20,12 +22,20 @@ mod feed;
 mod fingerprint;
 mod holdout;
 mod join;
+mod kept_keyframes;
 mod live;
 mod marks;
 mod method;
+mod model_bounds;
+mod next_commands;
 mod open;
+mod open_mark;
+mod partial;
 mod print;
+mod recovery;
+mod render_budget;
 mod replay;
+mod report;
 mod run_folder;
 mod scene_hint;
 mod session;
@@ -39,6 +49,7 @@ mod test_data;
 mod training;
 mod training_args;
 mod turns;
+mod viewer;
 
 use clap::Parser;
 use std::io::Write;
@@ -48,11 +59,13 @@ fn main() -> ExitCode {
     keep_wayland_quiet();
     let cli = cli::Cli::parse();
     print::start_log(cli.verbose);
-    match commands::run(cli.command) {
-        Ok(exit) => exit.into(),
+    let ended = commands::run(cli.command);
+    print::flush();
+    match ended {
+        Ok(exit) => exit.or_lost_output().into(),
         Err(error) if exit::is_broken_pipe(&error) => exit::Exit::Done.into(),
         Err(error) => {
-            // When stderr is gone too, the exit code still tells.
+            // Where stderr is gone too, the exit code remains.
             let _ = writeln!(std::io::stderr(), "error: {error:#}");
             exit::of(&error).into()
         }

@@ -1,11 +1,14 @@
 //! Which scene model: by its name on the command line, new or out of a folder.
 
+mod absent;
 mod kind;
 
+pub(crate) use absent::Absent;
 pub(crate) use kind::Kind;
 
 use crate::config::Train;
 use crate::exit::BadArgument;
+use crate::model_bounds::Bounds;
 use crate::run_folder::{expect_model, expect_one_model};
 use crate::splat_file;
 use anyhow::Context;
@@ -118,19 +121,43 @@ pub(crate) fn kind_in(folder: &Path) -> anyhow::Result<Option<Kind>> {
 
 /// A saved model: its folder, of any kind, or a file of splats.
 pub(crate) fn load(gpu: Arc<Gpu>, model: &Path) -> anyhow::Result<Box<dyn Method>> {
+    Ok(load_with_bounds(gpu, model, false)?.method)
+}
+
+/// A saved model in GPU memory.
+pub(crate) struct Loaded {
+    pub(crate) kind: Kind,
+    pub(crate) method: Box<dyn Method>,
+    /// Where most of it lies; `None` where it is empty or the bounds were not requested.
+    pub(crate) bounds: Option<Bounds>,
+}
+
+/// A saved model as [`load`] reads it, and where most of it lies if `wants_bounds`.
+pub(crate) fn load_with_bounds(gpu: Arc<Gpu>, model: &Path, wants_bounds: bool) -> anyhow::Result<Loaded> {
     expect_model(model)?;
     match kind_in(model)? {
-        Some(Kind::Tsdf) => return Ok(Box::new(Aligned::of_folder(TsdfModel::load(gpu, model)?, model)?)),
-        Some(Kind::Nerf) => return Ok(Box::new(Aligned::of_folder(NerfModel::load(gpu, model)?, model)?)),
+        Some(Kind::Tsdf) => {
+            let mut tsdf = TsdfModel::load(gpu, model)?;
+            let lattice = tsdf.lattice().filter(|_| wants_bounds).cloned();
+            let bounds = match lattice {
+                Some(lattice) => Bounds::of_blocks(tsdf.blocks()?.keys(), &lattice),
+                None => None,
+            };
+            return Ok(Loaded { kind: Kind::Tsdf, method: Box::new(Aligned::of_folder(tsdf, model)?), bounds });
+        }
+        Some(Kind::Nerf) => {
+            let nerf = NerfModel::load(gpu, model)?;
+            let extent = nerf.extent().filter(|_| wants_bounds);
+            let bounds = extent.map(|extent| Bounds { center_m: extent.center_m, radius_m: extent.radius_m });
+            return Ok(Loaded { kind: Kind::Nerf, method: Box::new(Aligned::of_folder(nerf, model)?), bounds });
+        }
         Some(Kind::Splat) | None => {}
     }
     let splats = splat_file::read(model)?;
-    let model = if model.is_dir() { Some(model) } else { None };
+    let bounds = if wants_bounds { Bounds::of_splats(&splats) } else { None };
     let trainer = SplatTrainer::from_arrays(gpu, SplatOptions::default(), &splats)?;
-    Ok(Box::new(match model {
-        Some(folder) => trainer.with_fixes(folder)?,
-        None => trainer,
-    }))
+    let method: Box<dyn Method> = Box::new(if model.is_dir() { trainer.with_fixes(model)? } else { trainer });
+    Ok(Loaded { kind: Kind::Splat, method, bounds })
 }
 
 /// The options of a rig file as the trainer wants them; `steps` when their number is settled beforehand.

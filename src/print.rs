@@ -1,26 +1,179 @@
 //! What people and programs see: results on stdout, log and progress on stderr.
+//!
+//! A command whose result is its output (`devices`, `metrics`) prints with [`line()`] and [`json`], which fail when stdout does.
+//! A command whose result is a file (`train`, `run`, `record`) prints with [`report`] and [`report_json`], which never fail: a
+//! closed terminal or a full disk costs the lines, not the model. A thread of its own writes them, so that a terminal that takes no
+//! output holds up nothing. [`lost_output`] says afterwards whether any lines were lost.
 
 use anyhow::Context;
-use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
+use console::Term;
+use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle, TermLike};
 use serde::Serialize;
 use std::fmt::Display;
 use std::io::Write;
-use std::sync::LazyLock;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{SyncSender, sync_channel};
+use std::sync::{LazyLock, Mutex, PoisonError};
+use std::time::Duration;
 
-/// Stdout took no more.
+/// Writing to stdout failed.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot write to stdout")]
 pub(crate) struct StdoutError(#[source] pub(crate) std::io::Error);
 
 /// The bars on stderr; log lines go above them.
-static BARS: LazyLock<MultiProgress> = LazyLock::new(MultiProgress::new);
+static BARS: LazyLock<MultiProgress> = LazyLock::new(|| MultiProgress::with_draw_target(target()));
+/// Whether a line of [`report`] could not be written.
+static LOST_OUTPUT: AtomicBool = AtomicBool::new(false);
+
+/// Pieces of output that may wait to be written: a terminal that takes none, such as one behind a broken connection, holds up
+/// nobody until there are more.
+const MAX_WAITING: usize = 4096;
+/// A program that ends waits this long for its output to be taken.
+const MAX_FLUSH: Duration = Duration::from_secs(5);
+
+/// A piece of output on its way to a stream.
+enum Piece {
+    Out(Vec<u8>),
+    Err(Vec<u8>),
+    /// Answered when everything before it was written.
+    Flush(SyncSender<()>),
+}
+
+/// Takes output to the thread that writes it.
+static WRITER: LazyLock<SyncSender<Piece>> = LazyLock::new(|| {
+    let (sender, pieces) = sync_channel(MAX_WAITING);
+    std::thread::spawn(move || pieces.into_iter().for_each(write));
+    sender
+});
+
+fn write(piece: Piece) {
+    match piece {
+        Piece::Out(bytes) => {
+            let mut stdout = std::io::stdout().lock();
+            if let Err(error) = stdout.write_all(&bytes).and_then(|()| stdout.flush()) {
+                note_lost(&error.to_string());
+            }
+        }
+        // Lost with its terminal, or on a full disk.
+        Piece::Err(bytes) => drop(std::io::stderr().write_all(&bytes)),
+        Piece::Flush(done) => drop(done.send(())),
+    }
+}
+
+fn note_lost(why: &str) {
+    if !LOST_OUTPUT.swap(true, Ordering::Relaxed) {
+        log::warn!("cannot write to stdout ({why}): output is lost, the work continues");
+    }
+}
+
+/// Waits until output is written, for a moment where nobody takes it.
+pub(crate) fn flush() {
+    let (done, is_done) = sync_channel(1);
+    let is_written = WRITER.try_send(Piece::Flush(done)).is_ok() && is_done.recv_timeout(MAX_FLUSH).is_ok();
+    if !is_written {
+        LOST_OUTPUT.store(true, Ordering::Relaxed);
+    }
+}
+
+/// Where bars are drawn: on stderr where that is a terminal.
+fn target() -> ProgressDrawTarget {
+    let term = Term::stderr();
+    if term.is_term() {
+        ProgressDrawTarget::term_like(Box::new(BarTerm { term, drawn: Mutex::default() }))
+    } else {
+        ProgressDrawTarget::hidden()
+    }
+}
+
+/// A terminal that may disappear, or stop taking output, at any time: what is drawn goes to the thread that writes.
+///
+/// indicatif's own target waits for the terminal, and panics when drawing fails (`MultiProgress::suspend`), as it does with EIO
+/// once a terminal is closed.
+#[derive(Debug)]
+struct BarTerm {
+    term: Term,
+    /// Since the last flush.
+    drawn: Mutex<String>,
+}
+
+impl BarTerm {
+    fn draw(&self, text: &str) -> std::io::Result<()> {
+        self.drawn.lock().unwrap_or_else(PoisonError::into_inner).push_str(text);
+        Ok(())
+    }
+
+    fn move_cursor(&self, n: usize, direction: char) -> std::io::Result<()> {
+        if n > 0 { self.draw(&format!("\x1b[{n}{direction}")) } else { Ok(()) }
+    }
+}
+
+impl TermLike for BarTerm {
+    fn width(&self) -> u16 {
+        self.term.size().1
+    }
+
+    fn height(&self) -> u16 {
+        self.term.size().0
+    }
+
+    fn move_cursor_up(&self, n: usize) -> std::io::Result<()> {
+        self.move_cursor(n, 'A')
+    }
+
+    fn move_cursor_down(&self, n: usize) -> std::io::Result<()> {
+        self.move_cursor(n, 'B')
+    }
+
+    fn move_cursor_right(&self, n: usize) -> std::io::Result<()> {
+        self.move_cursor(n, 'C')
+    }
+
+    fn move_cursor_left(&self, n: usize) -> std::io::Result<()> {
+        self.move_cursor(n, 'D')
+    }
+
+    fn write_line(&self, text: &str) -> std::io::Result<()> {
+        self.draw(&format!("{text}\n"))
+    }
+
+    fn write_str(&self, text: &str) -> std::io::Result<()> {
+        self.draw(text)
+    }
+
+    fn clear_line(&self) -> std::io::Result<()> {
+        self.draw("\r\x1b[2K")
+    }
+
+    fn flush(&self) -> std::io::Result<()> {
+        let drawn = std::mem::take(&mut *self.drawn.lock().unwrap_or_else(PoisonError::into_inner));
+        if !drawn.is_empty() {
+            let _ = WRITER.try_send(Piece::Err(drawn.into_bytes())); // A bar nobody looks at is drawn again later.
+        }
+        Ok(())
+    }
+}
 
 /// Prints one line of the result.
 pub(crate) fn line(text: impl Display) -> Result<(), StdoutError> {
+    flush();
     BARS.suspend(|| {
         let mut stdout = std::io::stdout().lock();
         writeln!(stdout, "{text}").and_then(|()| stdout.flush()).map_err(StdoutError)
     })
+}
+
+/// Prints one line about a result that lies elsewhere. Where stdout fails or takes nothing the line is lost, which is logged once.
+pub(crate) fn report(text: impl Display) {
+    let sent = BARS.suspend(|| WRITER.try_send(Piece::Out(format!("{text}\n").into_bytes())));
+    if sent.is_err() {
+        note_lost("it takes no more");
+    }
+}
+
+/// Whether a line of [`report`] was lost.
+pub(crate) fn lost_output() -> bool {
+    LOST_OUTPUT.load(Ordering::Relaxed)
 }
 
 /// A count with its word: `1 image`, `2 images`.
@@ -34,7 +187,20 @@ pub(crate) fn counted(n: u64, what: &str) -> String {
 
 /// Prints one JSON object on a line of its own.
 pub(crate) fn json(value: &impl Serialize) -> anyhow::Result<()> {
-    Ok(line(serde_json::to_string(value).context("cannot write the result as JSON")?)?)
+    Ok(line(json_text(value)?)?)
+}
+
+/// Prints one JSON object on a line of its own, as [`report`] does.
+///
+/// # Errors
+/// If the value has no JSON form.
+pub(crate) fn report_json(value: &impl Serialize) -> anyhow::Result<()> {
+    report(json_text(value)?);
+    Ok(())
+}
+
+fn json_text(value: &impl Serialize) -> anyhow::Result<String> {
+    serde_json::to_string(value).context("cannot write the result as JSON")
 }
 
 /// A progress bar on stderr; nothing where stderr is no terminal or `hidden` is set.
@@ -63,15 +229,16 @@ pub(crate) fn start_log(verbose: u8) {
         .init();
 }
 
-/// Stderr, with the bars moved out of the way.
+/// Stderr, with the bars moved out of the way. Records that cannot be written are lost, never an error of whoever logged.
 struct AboveBars;
 
 impl Write for AboveBars {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        BARS.suspend(|| std::io::stderr().write(bytes))
+        let _ = BARS.suspend(|| WRITER.try_send(Piece::Err(bytes.to_vec())));
+        Ok(bytes.len())
     }
 
     fn flush(&mut self) -> std::io::Result<()> {
-        std::io::stderr().flush()
+        Ok(())
     }
 }

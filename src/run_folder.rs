@@ -40,6 +40,17 @@ pub(crate) fn refuse_model(folder: &Path) -> Result<(), BadArgument> {
     }
 }
 
+/// Refuses to write results into the folder of the data.
+pub(crate) fn refuse_data(out: &Path, data: &Path) -> Result<(), BadArgument> {
+    let whole = |path: &Path| path.canonicalize().ok();
+    match (whole(out), whole(data)) {
+        (Some(folder), Some(data)) if folder == data => {
+            Err(BadArgument(format!("--out {}: this is the folder of the data, name another one", out.display())))
+        }
+        _ => Ok(()),
+    }
+}
+
 /// Refuses the folder of a run of several methods where one model is meant, and names theirs.
 pub(crate) fn expect_one_model(folder: &Path) -> Result<(), BadArgument> {
     let holds_one = |folder: &Path| MODEL_FILES.iter().chain([&CHECKPOINT]).any(|name| folder.join(name).exists());
@@ -74,6 +85,19 @@ pub(crate) fn expect_model(model: &Path) -> anyhow::Result<()> {
         return Err(BadArgument(told).into());
     }
     Ok(())
+}
+
+/// The models at a path: itself, or those in the folder of a run of several methods. Refuses what [`expect_model`] refuses;
+/// of several methods those without a model are left out, unless none has one.
+pub(crate) fn models_at(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let holds_model = |folder: &Path| MODEL_FILES.iter().any(|name| folder.join(name).exists());
+    let inside = Kind::ALL.into_iter().map(|kind| path.join(kind.name())).filter(|folder| holds_model(folder));
+    let inside: Vec<PathBuf> = inside.collect();
+    if path.is_dir() && !holds_model(path) && !inside.is_empty() {
+        return Ok(inside);
+    }
+    expect_model(path)?;
+    Ok(vec![path.to_owned()])
 }
 
 /// Folders that this run made; a refused run takes them back.
@@ -170,14 +194,24 @@ fn make(asked: Option<&Path>) -> anyhow::Result<PathBuf> {
         lock(folder)?;
         return Ok(folder.to_owned());
     }
+    make_in(Path::new(RUNS), "")
+}
+
+/// Makes a folder for a model that the folder of its run refuses, among the temporary files.
+pub(crate) fn make_rescue() -> anyhow::Result<PathBuf> {
+    make_in(&std::env::temp_dir(), "fieldrig-")
+}
+
+/// Makes a new folder by the name of the time.
+fn make_in(parent: &Path, prefix: &str) -> anyhow::Result<PathBuf> {
     #[expect(clippy::disallowed_methods, reason = "a name for people; nothing is measured by it")]
     let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    std::fs::create_dir_all(RUNS).context("cannot make the folder runs")?;
-    let name = name_from_time(since_epoch);
+    std::fs::create_dir_all(parent).with_context(|| format!("cannot make the folder {}", parent.display()))?;
+    let name = format!("{prefix}{}", name_from_time(since_epoch));
     for attempt in 1..100 {
         let folder = match attempt {
-            1 => Path::new(RUNS).join(&name),
-            _ => Path::new(RUNS).join(format!("{name}-{attempt}")),
+            1 => parent.join(&name),
+            _ => parent.join(format!("{name}-{attempt}")),
         };
         match std::fs::create_dir(&folder) {
             Ok(()) => {
@@ -188,7 +222,7 @@ fn make(asked: Option<&Path>) -> anyhow::Result<PathBuf> {
             Err(error) => return Err(error).with_context(|| format!("cannot make the folder {}", folder.display())),
         }
     }
-    bail!("runs/{name} and ninety-eight more exist already: name a folder with --out")
+    bail!("{} and ninety-eight more exist already: name a folder with --out", parent.join(name).display())
 }
 
 /// Keeps other runs out of a folder as long as this process lives.
@@ -213,7 +247,10 @@ pub(crate) fn save_model(method: &mut dyn Method, folder: &Path) -> anyhow::Resu
         // Of a run that was killed while it saved.
         std::fs::remove_dir_all(&unfinished).with_context(|| format!("cannot remove {}", unfinished.display()))?;
     }
-    method.save(&unfinished)?;
+    if let Err(error) = method.save(&unfinished) {
+        let _ = std::fs::remove_dir_all(&unfinished); // What it holds is of no use, and takes room.
+        return Err(error.into());
+    }
     // Splats and blocks come last: a folder that holds them holds the whole model.
     for name in MODEL_FILES.iter().filter(|name| unfinished.join(name).exists()) {
         let place = folder.join(name);
@@ -314,7 +351,13 @@ mod tests {
         assert_eq!(made, [asked.join("tsdf"), asked.join("splat")]);
         expect_one_model(&asked).expect("there is none yet");
         std::fs::write(made[0].join(CHECKPOINT), b"{}").expect("file");
+        assert!(models_at(&asked).is_err(), "a checkpoint is not a model");
         std::fs::write(made[1].join("splats.ply"), b"{}").expect("file");
+        assert_eq!(models_at(&asked).expect("one of them"), [asked.join("splat")]);
+        std::fs::write(made[0].join("model.json"), b"{}").expect("file");
+        assert_eq!(models_at(&asked).expect("both"), [asked.join("splat"), asked.join("tsdf")]);
+        assert_eq!(models_at(&made[0]).expect("itself"), [asked.join("tsdf")]);
+        std::fs::remove_file(made[0].join("model.json")).expect("file");
         let told = expect_one_model(&asked).expect_err("two").0;
         assert!(told.contains("out/splat or ") && told.ends_with("out/tsdf"), "{told}");
         expect_one_model(&made[1]).expect("one");

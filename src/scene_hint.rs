@@ -1,7 +1,8 @@
-//! Where an orbiting view starts: around the point the cameras look at.
+//! Where an orbiting view starts: around the point the cameras look at, else around the model.
 
+use crate::model_bounds::Bounds;
 use kinematics::Transform;
-use nalgebra::{Matrix3, Point3, Vector3};
+use nalgebra::{Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use std::sync::Arc;
 use trainer::Keyframe;
 use viz::SceneHint;
@@ -11,17 +12,41 @@ const BELIEVED_AHEAD_M: f64 = 0.5;
 /// Weight of that belief against one camera's axis: it decides only along directions that no axis decides.
 const BELIEF: f64 = 0.01;
 
+/// Distance of a view from outside, in radii of the model: most of it fits into a view of 50 degrees.
+const DISTANCE_RADII: f64 = 2.0;
+/// Direction from the model to a view from outside: from the front right, 30 degrees above the horizon.
+const TOWARDS_VIEW: [f64; 3] = [0.5, -0.707, 0.5];
+
 /// The point nearest to all optical axes, from the first camera; `None` without keyframes.
 pub(crate) fn from_keyframes(keyframes: &[Arc<Keyframe>]) -> Option<SceneHint> {
-    let poses: Vec<Transform> = keyframes.iter().map(|keyframe| keyframe.world_from_camera).collect();
-    let world_from_camera = *poses.first()?;
-    let center = nearest_to_axes(&poses)?;
-    let distances_m = poses.iter().map(|pose| (center.coords - pose.translation.vector).norm());
+    from_cameras(keyframes.iter().map(|keyframe| keyframe.world_from_camera).collect())
+}
+
+/// The point nearest to all optical axes, from the first camera; `None` without cameras.
+pub(crate) fn from_cameras(world_from_cameras: Vec<Transform>) -> Option<SceneHint> {
+    let world_from_camera = *world_from_cameras.first()?;
+    let center = nearest_to_axes(&world_from_cameras)?;
+    let distances_m = world_from_cameras.iter().map(|pose| (center.coords - pose.translation.vector).norm());
     Some(SceneHint {
         center_m: center.coords.into(),
-        radius_m: distances_m.sum::<f64>() / poses.len() as f64,
+        radius_m: distances_m.sum::<f64>() / world_from_cameras.len() as f64,
         world_from_camera,
     })
+}
+
+/// A view of the whole model from outside and slightly above, z up.
+pub(crate) fn from_bounds(bounds: &Bounds) -> SceneHint {
+    let towards_view = Vector3::from(TOWARDS_VIEW).normalize();
+    let forward = -towards_view;
+    let right = forward.cross(&Vector3::z()).normalize();
+    let axes = Matrix3::from_columns(&[right, forward.cross(&right), forward]);
+    let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
+    let position_m = Vector3::from(bounds.center_m) + DISTANCE_RADII * bounds.radius_m * towards_view;
+    SceneHint {
+        center_m: bounds.center_m,
+        radius_m: bounds.radius_m,
+        world_from_camera: Transform::from_parts(Translation3::from(position_m), rotation),
+    }
 }
 
 /// Least squares over the distances to the axes, with a weak pull towards a point ahead of each camera.
@@ -66,5 +91,18 @@ mod tests {
         let center = nearest_to_axes(&[pose]).expect("a camera");
         assert!((center - Point3::new(1.0, 2.5, 3.0)).norm() < ABS_M, "{center}");
         assert!(from_keyframes(&[]).is_none());
+    }
+
+    #[test]
+    fn a_view_from_outside_looks_at_the_center_and_stands_upright() {
+        const ABS_M: f64 = 1e-9;
+        let bounds = Bounds { center_m: [1.0, 2.0, 3.0], radius_m: 0.5 };
+        let pose = from_bounds(&bounds).world_from_camera;
+        let center_in_camera = pose.inverse() * Point3::from(bounds.center_m);
+        assert!((center_in_camera - Point3::new(0.0, 0.0, 1.0)).norm() < ABS_M, "{center_in_camera}");
+        let right = pose.rotation * Vector3::x();
+        let down = pose.rotation * Vector3::y();
+        assert!(right.z.abs() < ABS_M && down.z < -0.5, "{right} {down}");
+        assert!(pose.translation.vector.z > bounds.center_m[2]);
     }
 }

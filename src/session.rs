@@ -1,15 +1,19 @@
 //! One model in training: its keyframes, its clock, and what is told of it.
 
 use crate::bench::statistics::median;
-use crate::checkpoints::Checkpoints;
+use crate::checkpoints::{Checkpoints, Snapshot};
 use crate::clock::Clock;
 use crate::decisions::DecisionLog;
 use crate::evaluate::{Evaluator, ImageScores, Scores};
+use crate::join::split_name;
 use crate::marks::Marks;
-use crate::method::Kind;
+use crate::method::{self, Absent, Kind};
+use crate::next_commands::{self, DataSource, SavedModel};
+use crate::open_mark::OpenMark;
+use crate::recovery::{self, Recovery};
 use crate::stop::Stop;
 use crate::turns::TURN;
-use crate::{print, run_folder};
+use crate::{camera_list, checkpoints, exit, print, report, run_folder};
 use indicatif::ProgressBar;
 use serde::Serialize;
 use std::collections::{BTreeMap, VecDeque};
@@ -17,15 +21,15 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::align::Alignment;
+use trainer::checkpoint::Checkpoint;
 use trainer::gpu::{Gpu, PassTiming};
-use trainer::{Keyframe, Method, Part, Picture, Progress, RenderRequest, Split};
+use trainer::splat::PosedLens;
+use trainer::{DepthMap, Keyframe, Method, Part, Picture, Progress, RenderRequest, Split};
 
 /// Steps that a profile is the median of.
 const N_PROFILED: usize = 21;
 /// After large buffers were let go of, drivers are slow for a while.
 const BEFORE_PROFILE: Duration = Duration::from_millis(700);
-/// Where drawing takes longer, a mark scores fewer test images: a neural field takes seconds for each on a processor.
-const MOST_SCORING_AT_MARKS: Duration = Duration::from_secs(60);
 /// Points of the PSNR curve that are kept; past them every second one goes.
 const MAX_HISTORY: usize = 512;
 
@@ -84,6 +88,11 @@ pub(crate) struct Session {
     method: Box<dyn Method>,
     checkpoints: Option<Checkpoints>,
     decisions: Option<DecisionLog>,
+    data: DataSource,
+    recovery: Option<Recovery>,
+    /// Evicted keyframes without their pixels, which the newest checkpoint may know; those before the last one come first.
+    evicted: Vec<Arc<Keyframe>>,
+    n_evicted_before_last: usize,
     gpu: Arc<Gpu>,
     /// At the marks.
     evaluator: Evaluator,
@@ -100,6 +109,10 @@ pub(crate) struct Session {
     /// When it was done though others were not, seconds.
     rested_secs: Option<f64>,
     marks: Marks,
+    /// Reached and not scored yet.
+    open_mark: Option<OpenMark>,
+    /// Whether the caller scores an open mark image by image.
+    scores_stepwise: bool,
     told: Vec<Eval>,
     history: Vec<(f64, f64)>,
     /// Newest PSNR of each test keyframe, by camera and stamp.
@@ -174,7 +187,35 @@ struct Report<'a, T: Serialize> {
     /// GPU time of each pass of a step, milliseconds, where it was asked for.
     passes: Vec<(&'static str, f64)>,
     marks: &'a [Eval],
-    per_image: &'a [ImageScores],
+    per_image: Vec<NamedScores<'a>>,
+}
+
+/// Scores of one test image, with its name.
+#[derive(Debug, Serialize)]
+struct NamedScores<'a> {
+    name: String,
+    #[serde(flatten)]
+    scores: &'a ImageScores,
+}
+
+/// A trained model after it was saved and scored, still in GPU memory.
+pub(crate) struct Finished {
+    pub(crate) kind: Kind,
+    pub(crate) method: Box<dyn Method>,
+    pub(crate) folder: PathBuf,
+    /// Seconds of training.
+    pub(crate) seconds: f64,
+    /// Of the saved model, on the test images.
+    pub(crate) scores: Scores,
+    data: DataSource,
+    n_tests: usize,
+    tell: Tell,
+}
+
+impl Finished {
+    fn saved(&self) -> SavedModel<'_> {
+        SavedModel { kind: self.kind, folder: &self.folder, data: &self.data, n_tests: self.n_tests }
+    }
 }
 
 /// One of the sessions that end together: where its results go, and what only its kind of run knows of it.
@@ -184,21 +225,49 @@ pub(crate) struct Ending<P> {
     pub(crate) particulars: P,
 }
 
-/// Saves the models; then scores each a last time, writes its report, and tells the end.
-pub(crate) fn finish(mut endings: Vec<Ending<impl Serialize>>) -> anyhow::Result<()> {
+/// Saves the models; then scores each a last time, writes its report, and tells the end. The models come back, to be shown.
+pub(crate) fn finish(mut endings: Vec<Ending<impl Serialize>>) -> anyhow::Result<Vec<Finished>> {
     // Saved before any is scored: a second Ctrl-C during the scoring loses nothing.
     let ended_secs: Vec<f64> = endings.iter_mut().map(|ending| ending.session.halt()).collect::<anyhow::Result<_>>()?;
-    let mut hashes = Vec::new();
-    for (Ending { session, out, .. }, seconds) in endings.iter_mut().zip(&ended_secs) {
-        hashes.push(session.save(out, *seconds)?);
+    let mut saved = Vec::new();
+    let mut failed = Ok(());
+    for (mut ending, seconds) in endings.into_iter().zip(ended_secs) {
+        // One model that cannot be saved does not cost the others.
+        match ending.session.save(&ending.out, seconds) {
+            Ok(Saved { folder, sha256, failed: error }) => {
+                ending.out = folder;
+                ending.session.write_cameras(&ending.out);
+                failed = failed.and(error.map_or(Ok(()), Err));
+                saved.push((ending, seconds, sha256));
+            }
+            Err(error) => failed = failed.and(Err(error)),
+        }
     }
-    if endings.iter().any(|ending| ending.session.stop.asked()) {
+    if saved.iter().any(|(ending, ..)| ending.session.stop.asked()) {
         log::info!("saved; scoring the test images, Ctrl-C again leaves that out");
     }
-    for ((Ending { session, out, particulars }, seconds), hash) in endings.into_iter().zip(ended_secs).zip(hashes) {
-        session.tell_end(&out, seconds, &hash, &particulars)?;
+    let mut finished = Vec::new();
+    for (Ending { session, out, particulars }, seconds, sha256) in saved {
+        match session.tell_end(&out, seconds, &sha256, &particulars) {
+            Ok(model) => finished.push(model),
+            Err(error) => failed = failed.and(Err(error)),
+        }
     }
-    Ok(())
+    if finished.iter().any(|model| model.tell == Tell::Lines) {
+        let models: Vec<SavedModel<'_>> = finished.iter().map(Finished::saved).collect();
+        for line in next_commands::lines(&next_commands::for_models(&models)) {
+            print::report(line);
+        }
+    }
+    failed.map(|()| finished)
+}
+
+/// A model on the disk.
+struct Saved {
+    folder: PathBuf,
+    sha256: String,
+    /// Why it is not in the folder of its run.
+    failed: Option<anyhow::Error>,
 }
 
 impl Session {
@@ -217,6 +286,10 @@ impl Session {
             method,
             checkpoints: None,
             decisions: None,
+            data: DataSource::default(),
+            recovery: None,
+            evicted: Vec::new(),
+            n_evicted_before_last: 0,
             gpu,
             evaluator: evaluators.at_marks,
             most_at_marks: evaluators.most_at_marks,
@@ -228,6 +301,8 @@ impl Session {
             had: Duration::ZERO,
             rested_secs: None,
             marks: Marks::default(),
+            open_mark: None,
+            scores_stepwise: false,
             told: Vec::new(),
             history: Vec::new(),
             newest_psnr: BTreeMap::new(),
@@ -248,6 +323,12 @@ impl Session {
         Self { stop: stop.clone(), ..self }
     }
 
+    /// Leaves the scoring of marks to [`Self::score_next`]: the caller draws pictures in between, and neither trains nor pushes
+    /// keyframes while [`Self::is_scoring`], so that all images of a mark are scored on one state of the model.
+    pub(crate) fn with_stepwise_scoring(self) -> Self {
+        Self { scores_stepwise: true, ..self }
+    }
+
     /// Tells at the end what each pass of a step takes, if asked to.
     pub(crate) fn with_profile(self, profiles: bool) -> Self {
         Self { profiles, ..self }
@@ -256,6 +337,16 @@ impl Session {
     /// Writes down from now on what depends on the clock.
     pub(crate) fn with_decisions(self, decisions: DecisionLog) -> Self {
         Self { decisions: Some(decisions), ..self }
+    }
+
+    /// Names the data in the report and in the commands to type next.
+    pub(crate) fn with_data(self, data: DataSource) -> Self {
+        Self { data, ..self }
+    }
+
+    /// Continues on another device where the GPU fails.
+    pub(crate) fn with_recovery(self, recovery: Recovery) -> Self {
+        Self { recovery: Some(recovery), ..self }
     }
 
     /// Goes on where earlier runs had trained for so long; marks they reached are not told again.
@@ -297,10 +388,7 @@ impl Session {
 
     /// Gives a keyframe to the model; test keyframes are kept for evaluation too.
     pub(crate) fn push(&mut self, keyframe: &Arc<Keyframe>) -> anyhow::Result<()> {
-        if keyframe.split == Split::Test {
-            self.tests.push_back(keyframe.clone());
-        }
-        self.keyframes.push(keyframe.clone());
+        self.hold(keyframe);
         self.method.push(keyframe.clone())?;
         if let Some(decisions) = &mut self.decisions {
             decisions.pushed(self.method.n_taken()?, keyframe);
@@ -308,9 +396,21 @@ impl Session {
         Ok(())
     }
 
+    /// Holds a keyframe that the model has learned from before, in the run that is resumed.
+    pub(crate) fn hold(&mut self, keyframe: &Arc<Keyframe>) {
+        if keyframe.split == Split::Test {
+            self.tests.push_back(keyframe.clone());
+        }
+        self.keyframes.push(keyframe.clone());
+    }
+
     /// Takes a keyframe back.
     pub(crate) fn remove(&mut self, camera: &str, stamp: kinematics::Stamp) -> anyhow::Result<()> {
         let is_other = |held: &Arc<Keyframe>| held.camera.as_ref() != camera || held.stamp != stamp;
+        if self.recovery.is_some() {
+            let evicted = self.keyframes.iter().filter(|held| !is_other(held));
+            self.evicted.extend(evicted.map(|keyframe| Arc::new(without_pixels(keyframe))));
+        }
         self.keyframes.retain(is_other);
         self.tests.retain(is_other);
         self.newest_psnr.retain(|(of, nanos), _| of != camera || *nanos != stamp.0);
@@ -371,18 +471,105 @@ impl Session {
         if let Some(decisions) = &mut self.decisions {
             decisions.begun();
         }
-        Ok(self.method.step(n_most.min(left))?)
+        let n = self.method.step(n_most.min(left))?;
+        recovery::lose_for_tests(&self.gpu, self.method.progress().step);
+        Ok(n)
+    }
+
+    /// An error where the GPU failed.
+    pub(crate) fn check_gpu(&self) -> anyhow::Result<()> {
+        Ok(self.gpu.check()?)
+    }
+
+    /// Waits for what is queued.
+    pub(crate) fn wait(&self) -> anyhow::Result<()> {
+        Ok(self.gpu.wait()?)
+    }
+
+    /// What it needs to continue on another device.
+    pub(crate) fn recovery(&self) -> Option<&Recovery> {
+        self.recovery.as_ref()
+    }
+
+    /// Whether this run has written a checkpoint.
+    pub(crate) fn has_checkpoint(&mut self) -> bool {
+        self.checkpoints.as_mut().is_some_and(|checkpoints| checkpoints.newest().is_some())
+    }
+
+    /// Leaves this much out of the time of training.
+    pub(crate) fn exclude(&self, spent: Duration) {
+        self.clock.exclude(spent);
+    }
+
+    /// Lets go of a model on a device that failed; [`Self::restart_on`] makes it again.
+    pub(crate) fn drop_model(&mut self) {
+        self.method = Box::new(Absent);
+    }
+
+    /// Makes the model again on another device: from the newest checkpoint, or afresh where there is none.
+    pub(crate) fn restart_on(&mut self, gpu: &Arc<Gpu>) -> anyhow::Result<()> {
+        let Some(recovery) = &self.recovery else { anyhow::bail!("this run cannot continue on another device") };
+        let written = self.checkpoints.as_mut().and_then(Checkpoints::newest).map(Path::to_owned);
+        let checkpoint = match (written, &recovery.resumed) {
+            (Some(path), _) => Some(Checkpoint::read(&path)?),
+            (None, Some(folder)) => Some(checkpoints::read(folder)?),
+            (None, None) => None,
+        };
+        let held: Vec<Arc<Keyframe>> = recovery.known.iter().chain(&self.keyframes).cloned().collect();
+        let all = [&held[..], &self.evicted[..]].concat();
+        let resumed = checkpoint.map(|checkpoint| method::resume(gpu.clone(), &checkpoint, &all)).transpose();
+        let resumed = resumed.or_else(|error| {
+            if recovery::is_of_gpu(&error) {
+                return Err(error);
+            }
+            log::warn!("the newest checkpoint is of no use: {error:#}");
+            Ok(None)
+        })?;
+        let is_resumed = resumed.is_some();
+        let (mut method, rest) = match resumed {
+            Some(resumed) => (resumed.method, resumed.rest),
+            None => (recovery.recipe.clone().start(gpu.clone())?, held.clone()),
+        };
+        method.prepare()?;
+        let is_in =
+            |keyframes: &[Arc<Keyframe>], it: &Arc<Keyframe>| keyframes.iter().any(|other| Arc::ptr_eq(other, it));
+        for keyframe in self.evicted.iter().filter(|keyframe| !is_in(&rest, keyframe)) {
+            method.remove(&keyframe.camera, keyframe.stamp)?;
+        }
+        let from_step = method.n_taken()?;
+        // The log so far is that of a run that ended here; what follows is a log of its own.
+        self.decisions = None;
+        let settings = recovery.settings.after(is_resumed.then_some(from_step));
+        let mut decisions = DecisionLog::create(&recovery.folder, settings)?;
+        held.iter().filter(|keyframe| !is_in(&rest, keyframe)).for_each(|keyframe| decisions.had(from_step, keyframe));
+        for keyframe in rest.iter().filter(|keyframe| is_in(&held, keyframe)) {
+            method.push(keyframe.clone())?;
+            decisions.pushed(method.n_taken()?, keyframe);
+        }
+        log::info!(
+            "the GPU is back: training continues from {}",
+            if is_resumed { format!("the checkpoint of step {from_step}") } else { "the start".to_owned() }
+        );
+        (self.method, self.gpu, self.decisions) = (method, gpu.clone(), Some(decisions));
+        self.rested_secs = None;
+        Ok(())
     }
 
     /// Trains for a turn on a device that others use too, at most `n_most` steps; what was queued is done at its end.
-    pub(crate) fn take_turn(&mut self, n_most: impl Fn(&Self) -> u64) -> anyhow::Result<()> {
+    ///
+    /// `is_awaited`: whether somebody waits for the turn's end; asked after each submit.
+    pub(crate) fn take_turn(
+        &mut self,
+        n_most: impl Fn(&Self) -> u64,
+        is_awaited: impl Fn() -> bool,
+    ) -> anyhow::Result<()> {
         let begun = Instant::now();
         let mut n_steps = 0;
         loop {
             let n = self.learn(n_most(self))?;
             n_steps += n;
             let is_at_end = self.is_over() || self.is_idle() || n_most(self) == 0;
-            if n == 0 || is_at_end || begun.elapsed() >= TURN {
+            if n == 0 || is_at_end || begun.elapsed() >= TURN || is_awaited() {
                 break;
             }
         }
@@ -418,16 +605,57 @@ impl Session {
         }
         let seconds = self.secs();
         if let Some(checkpoints) = &mut self.checkpoints
-            && checkpoints.when_due(self.method.as_mut(), seconds)?
-            && let Some(decisions) = &mut self.decisions
+            && checkpoints.when_due(Snapshot {
+                method: self.method.as_mut(),
+                keyframes: &self.keyframes,
+                seconds,
+                is_finished: false,
+            })?
         {
-            decisions.checkpoint(self.method.n_taken()?);
+            if let Some(decisions) = &mut self.decisions {
+                decisions.checkpoint(self.method.n_taken()?);
+            }
+            // Until this one is written the one before is the newest, and that knows no keyframe that was evicted before it.
+            self.evicted.drain(..self.n_evicted_before_last);
+            self.n_evicted_before_last = self.evicted.len();
         }
-        if self.marks.reached(self.secs()) {
-            self.tell_mark()?;
+        if self.open_mark.is_none() && self.marks.reached(self.secs()) {
+            self.open_mark()?;
+            while !self.scores_stepwise && self.is_scoring() {
+                self.score_next()?;
+            }
         }
         self.show();
         Ok(())
+    }
+
+    /// Whether a mark was reached whose test images are not all scored.
+    pub(crate) fn is_scoring(&self) -> bool {
+        self.open_mark.is_some()
+    }
+
+    /// Scores one more test image of the open mark, and reports the mark after its last one.
+    pub(crate) fn score_next(&mut self) -> anyhow::Result<()> {
+        let Some(mut mark) = self.open_mark.take() else { return Ok(()) };
+        if self.stop.asked() {
+            return Ok(());
+        }
+        if let Some(keyframe) = mark.take_next() {
+            let before = Instant::now();
+            let score = |session: &mut Self| session.evaluator.score_named(session.method.as_mut(), &keyframe);
+            let scores = self.off_the_clock(score)?;
+            mark.add(scores, before.elapsed());
+        }
+        if mark.is_complete() {
+            return self.tell_mark(mark);
+        }
+        self.open_mark = Some(mark);
+        Ok(())
+    }
+
+    /// Sets whether pictures are asked for while it learns: submits are shorter then.
+    pub(crate) fn set_watched(&mut self, watched: bool) {
+        self.method.set_watched(watched);
     }
 
     /// Evaluates the test keyframe whose score is oldest, for a curve between the marks; counts as training time.
@@ -463,8 +691,8 @@ impl Session {
         self.method.progress()
     }
 
-    /// Saves the model after so many seconds of training; its hash comes back.
-    fn save(&mut self, out: &Path, seconds: f64) -> anyhow::Result<String> {
+    /// Saves the model after so many seconds of training; where its folder takes no more, in a folder for temporary files.
+    fn save(&mut self, out: &Path, seconds: f64) -> anyhow::Result<Saved> {
         if let Some(decisions) = self.decisions.take()
             && let Err(error) = decisions.end(self.method.n_taken()?)
         {
@@ -473,11 +701,47 @@ impl Session {
         if self.method.progress().primitives == 0 {
             log::warn!("the model is empty: nothing that was seen could be used");
         }
-        run_folder::save_model(self.method.as_mut(), out)?;
-        if let Some(checkpoints) = &mut self.checkpoints {
-            checkpoints.begin(self.method.as_mut(), seconds)?;
+        let saved = match run_folder::save_model(self.method.as_mut(), out) {
+            Ok(()) => Saved { folder: out.to_owned(), sha256: run_folder::checkpoint_sha256(out)?, failed: None },
+            Err(error) if exit::is_io(&error) => self.save_elsewhere(out, error)?,
+            Err(error) => return Err(error),
+        };
+        let is_finished = self.is_over() || self.is_idle();
+        if let (Some(checkpoints), None) = (&mut self.checkpoints, &saved.failed) {
+            let (method, keyframes) = (self.method.as_mut(), &self.keyframes[..]);
+            checkpoints.begin(Snapshot { method, keyframes, seconds, is_finished })?;
         }
-        run_folder::checkpoint_sha256(out)
+        Ok(saved)
+    }
+
+    /// Saves the model in a folder for temporary files, because that of its run refused it.
+    fn save_elsewhere(&mut self, out: &Path, refused: anyhow::Error) -> anyhow::Result<Saved> {
+        let save = |method: &mut dyn Method| {
+            let folder = run_folder::make_rescue()?;
+            run_folder::save_model(method, &folder)?;
+            let sha256 = run_folder::checkpoint_sha256(&folder)?;
+            Ok((folder, sha256))
+        };
+        match save(self.method.as_mut()) {
+            Ok((folder, sha256)) => {
+                let context =
+                    format!("cannot save the model in {}, it was saved in {}", out.display(), folder.display());
+                Ok(Saved { folder, sha256, failed: Some(refused.context(context)) })
+            }
+            Err(error) => {
+                let error: anyhow::Error = error;
+                log::error!("cannot save the model in a folder for temporary files either: {error:#}");
+                Err(refused.context(format!("cannot save the model in {}; {}", out.display(), self.what_is_left())))
+            }
+        }
+    }
+
+    /// What to continue from where the model could not be saved, as part of a sentence.
+    fn what_is_left(&mut self) -> String {
+        let has_checkpoint = self.has_checkpoint();
+        let Some(recovery) = &self.recovery else { return "there is no checkpoint either".to_owned() };
+        let left = recovery.what_is_left(has_checkpoint);
+        if has_checkpoint { format!("{left}; --out names another folder for the model") } else { left }
     }
 
     /// Scores the saved model a last time, writes the report, and tells the end.
@@ -487,7 +751,7 @@ impl Session {
         seconds: f64,
         checkpoint_sha256: &str,
         particulars: &impl Serialize,
-    ) -> anyhow::Result<()> {
+    ) -> anyhow::Result<Finished> {
         let outcome = self.score_at_end(seconds)?;
         let done = Done {
             event: "done",
@@ -500,6 +764,8 @@ impl Session {
             out,
             checkpoint_sha256,
         };
+        // Before a profile, which takes more steps.
+        let comparisons = self.compare(&outcome.per_image);
         let passes = if self.profiles { self.profile()? } else { Vec::new() };
         let report = Report {
             done: &done,
@@ -508,34 +774,110 @@ impl Session {
             parts: self.method.report(),
             passes,
             marks: &outcome.marks,
-            per_image: &outcome.per_image,
+            per_image: self.named(&outcome.per_image),
         };
-        run_folder::write_json(&out.join("report.json"), &report)?;
-        let last_checkpoint = self.checkpoints.as_mut().map_or(Ok(()), Checkpoints::wait);
+        let written = run_folder::write_json(&out.join("report.json"), &report);
+        let page = comparisons.and_then(|comparisons| self.write_page(out, &report, &comparisons));
+        if let Err(error) = &page {
+            log::warn!("no {}: {error:#}", report::FILE);
+        }
+        let last_checkpoint = written.and(self.checkpoints.as_mut().map_or(Ok(()), Checkpoints::wait));
         match self.tell {
             Tell::Json => {
                 if self.profiles {
                     let passes = &report.passes;
-                    print::json(&Profile { event: "profile", method: self.kind.name(), passes })?;
+                    print::report_json(&Profile { event: "profile", method: self.kind.name(), passes })?;
                 }
-                print::json(&done)?;
-                return last_checkpoint;
+                print::report_json(&done)?;
+                last_checkpoint?;
+                return Ok(self.finished(out, (seconds, done.scores), outcome.per_image.len()));
             }
-            Tell::Bar | Tell::Nothing => return last_checkpoint,
+            Tell::Bar | Tell::Nothing => {
+                last_checkpoint?;
+                return Ok(self.finished(out, (seconds, done.scores), outcome.per_image.len()));
+            }
             Tell::Lines => {}
         }
         for (name, millis) in &report.passes {
-            print::line(format_args!("{millis:9.3} ms  {name}"))?;
+            print::report(format_args!("{millis:9.3} ms  {name}"));
         }
-        print::line(format_args!(
+        print::report(format_args!(
             "{seconds:.1} s, {}, {}, {:.1} MB: {}",
             print::counted(done.steps, "step"),
             print::counted(done.primitives, self.method.primitive()),
             done.bytes as f64 / 1e6,
             done.scores
-        ))?;
-        print::line(format_args!("saved in {}", out.display()))?;
-        last_checkpoint
+        ));
+        let with_page = if page.is_ok() { ", with pictures and scores in report.html" } else { "" };
+        print::report(format_args!("saved in {}{with_page}", out.display()));
+        last_checkpoint?;
+        Ok(self.finished(out, (seconds, done.scores), outcome.per_image.len()))
+    }
+
+    fn finished(self, out: &Path, (seconds, scores): (f64, Scores), n_tests: usize) -> Finished {
+        let Self { kind, method, data, tell, .. } = self;
+        Finished { kind, method, folder: out.to_owned(), seconds, scores, data, n_tests, tell }
+    }
+
+    fn named<'a>(&self, images: &'a [ImageScores]) -> Vec<NamedScores<'a>> {
+        let name = |scores: &ImageScores| self.data.image_name(&scores.camera, scores.stamp_nanos);
+        images.iter().map(|scores| NamedScores { name: name(scores), scores }).collect()
+    }
+
+    /// Draws test images as the model predicts them; `scores` are theirs, in the same order.
+    fn compare(&mut self, scores: &[ImageScores]) -> anyhow::Result<Vec<report::Comparison>> {
+        let name = |scores: &ImageScores| self.data.image_name(&scores.camera, scores.stamp_nanos);
+        let scored = self.tests.iter().zip(scores).map(|(keyframe, scores)| report::Scored {
+            keyframe,
+            name: name(scores),
+            psnr: scores.psnr,
+            ssim: scores.ssim,
+        });
+        report::compare(self.method.as_mut(), &scored.collect::<Vec<_>>())
+    }
+
+    /// Writes the page that shows the report.
+    fn write_page(
+        &self,
+        out: &Path,
+        report: &Report<'_, impl Serialize>,
+        comparisons: &[report::Comparison],
+    ) -> anyhow::Result<()> {
+        let n_tests = report.per_image.len();
+        let model = SavedModel { kind: self.kind, folder: out, data: &self.data, n_tests };
+        let page = report::Page {
+            folder: out,
+            report: &serde_json::to_value(report)?,
+            primitive: self.method.primitive(),
+            comparisons,
+            next: &next_commands::for_models(&[model]),
+            settings: report::settings_in(out),
+            command: next_commands::this_command(),
+        };
+        page.write()
+    }
+
+    /// Lists where the model has the cameras of its keyframes; without the list a viewer starts from outside the model.
+    fn write_cameras(&mut self, out: &Path) {
+        let mut cameras = Vec::new();
+        for keyframe in &self.keyframes {
+            let lens = self.method.posed_lens(keyframe).unwrap_or_else(|error| {
+                log::debug!("the camera of a keyframe is listed without its correction: {error}");
+                PosedLens::of(keyframe)
+            });
+            cameras.push(camera_list::PosedCamera {
+                camera: keyframe.camera.to_string(),
+                stamp_nanos: keyframe.stamp.0,
+                split: split_name(keyframe.split).to_owned(),
+                size_px: keyframe.size_px,
+                focal_px: lens.focal_px,
+                principal_px: lens.principal_px,
+                world_from_camera: camera_list::row_major(&lens.world_from_camera),
+            });
+        }
+        if let Err(error) = camera_list::write(out, &cameras) {
+            log::warn!("no {}: {error:#}", camera_list::FILE);
+        }
     }
 
     /// GPU time of each kernel in a step, milliseconds: medians over [`N_PROFILED`] steps, in the order of the first.
@@ -594,20 +936,6 @@ impl Session {
         self.evaluator.score_all(self.method.as_mut(), tests.iter())
     }
 
-    /// Scores test keyframes spread over all, as many as a mark may; `None` where it was asked to stop meanwhile.
-    fn score_some(&mut self) -> anyhow::Result<Option<Vec<ImageScores>>> {
-        let before = Instant::now();
-        let stride = self.tests.len().div_ceil(self.most_at_marks).max(1);
-        let mut tests: Vec<(usize, Arc<Keyframe>)> = self.tests.iter().step_by(stride).cloned().enumerate().collect();
-        // However many of them are scored, they are spread evenly.
-        tests.sort_by_key(|(ix, _)| ix.reverse_bits());
-        let stop = self.stop.clone();
-        let goes_on = |n: usize| !stop.asked() && (n == 0 || before.elapsed() < MOST_SCORING_AT_MARKS);
-        let wanted = tests.iter().enumerate().take_while(|(n, _)| goes_on(*n)).map(|(_, (_, keyframe))| keyframe);
-        let images = self.evaluator.score_all(self.method.as_mut(), wanted)?;
-        Ok((!stop.asked()).then_some(images))
-    }
-
     /// Does what is not training: time stands still meanwhile.
     fn off_the_clock<T>(&mut self, work: impl FnOnce(&mut Self) -> anyhow::Result<T>) -> anyhow::Result<T> {
         self.gpu.wait()?;
@@ -619,11 +947,17 @@ impl Session {
         Ok(done)
     }
 
-    fn tell_mark(&mut self) -> anyhow::Result<()> {
-        // What was queued up to here belongs to the mark.
-        self.gpu.wait()?;
-        let seconds = self.secs();
-        let Some(images) = self.off_the_clock(Self::score_some)? else { return Ok(()) };
+    /// Opens the mark that was reached: what was queued up to here belongs to it.
+    fn open_mark(&mut self) -> anyhow::Result<()> {
+        self.method.n_taken()?;
+        self.open_mark = Some(OpenMark::new(self.secs(), self.tests.iter(), self.most_at_marks));
+        Ok(())
+    }
+
+    /// Reports a mark that was scored.
+    fn tell_mark(&mut self, mark: OpenMark) -> anyhow::Result<()> {
+        let seconds = mark.seconds;
+        let images = mark.into_images();
         for image in &images {
             self.newest_psnr.insert((image.camera.clone(), image.stamp_nanos), image.psnr);
         }
@@ -641,14 +975,14 @@ impl Session {
             step_millis: (progress.step > 0).then_some(progress.step_millis),
         };
         match self.tell {
-            Tell::Json => print::json(&eval)?,
-            Tell::Lines => print::line(format_args!(
+            Tell::Json => print::report_json(&eval)?,
+            Tell::Lines => print::report(format_args!(
                 "{seconds:7.2} s  step {:6}  {:>15}  {:7.2} ms a step  {}",
                 eval.step,
                 print::counted(eval.primitives, self.method.primitive()),
                 progress.step_millis,
                 eval.scores
-            ))?,
+            )),
             Tell::Bar | Tell::Nothing => {}
         }
         self.told.push(eval);
@@ -684,8 +1018,17 @@ impl Session {
     }
 }
 
+/// What a checkpoint knows a keyframe by.
+fn without_pixels(keyframe: &Keyframe) -> Keyframe {
+    let depth = keyframe.depth.as_ref().map(|depth| DepthMap { depth_m: [].into(), ..depth.clone() });
+    Keyframe { rgba_srgb: [].into(), depth, truth: None, ..keyframe.clone() }
+}
+
 /// For bars and such.
 #[expect(clippy::cast_possible_truncation, reason = "a cast of floats stops at the ends of u64")]
 fn whole_secs(secs: f64) -> u64 {
     secs as u64
 }
+
+#[cfg(test)]
+mod tests;

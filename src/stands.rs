@@ -98,6 +98,18 @@ impl Stands {
         })
     }
 
+    /// Continues after the keyframes of an earlier run: where the base stands first now is looked for among them.
+    pub(crate) fn after(mut self, keyframes: &[Arc<Keyframe>]) -> Self {
+        /// Of the earlier run: no stand of this one has this number.
+        const EARLIER: usize = usize::MAX;
+        if let Some(place) = keyframes.iter().rev().find_map(|keyframe| keyframe.base.as_ref()) {
+            (self.stand, self.world_from_base, self.world_from_told) =
+                (Some(EARLIER), place.world_from_base, place.world_from_told);
+        }
+        keyframes.iter().for_each(|keyframe| self.remember(keyframe));
+        self
+    }
+
     /// Takes a change of the keyframes; gives those that follow from all so far.
     pub(crate) fn push(&mut self, change: Change) -> Vec<Change> {
         self.later.push_back(change);

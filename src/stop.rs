@@ -1,38 +1,95 @@
-//! Ctrl-C: the first asks for an orderly end, the second ends at once.
+//! Signals that end a run: it stops, saves, and exits.
+//!
+//! SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal closed) ask for an orderly end. A second Ctrl-C ends the process at once;
+//! SIGHUP never does, because a closing terminal sends it more than once: the kernel to the foreground group, the shell to its jobs.
+//! Under `nohup`, where SIGHUP is ignored, it stays ignored.
 
 use anyhow::Context;
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::flag;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Exit code of a process ended by an interrupt, as shells tell it: 128 + SIGINT.
+/// Exit code of a process ended by an interrupt, as shells report it: 128 + SIGINT.
 const INTERRUPTED: i32 = 130;
 
-/// Whether the person at the keyboard wants an end. Clones tell the same.
+/// Whether the end was asked for. Clones share the answer.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Stop(Arc<AtomicBool>);
+pub(crate) struct Stop {
+    /// By the program itself.
+    asked: Arc<AtomicBool>,
+    /// By a signal.
+    signaled: Arc<AtomicBool>,
+    /// Whether the signal was logged.
+    logged: Arc<AtomicBool>,
+    /// What is logged then.
+    message: &'static str,
+}
 
 impl Stop {
-    /// Listens to Ctrl-C and to SIGTERM; at most once a process.
+    /// Listens to SIGINT, SIGTERM and SIGHUP; at most once a process.
     pub(crate) fn on_ctrl_c() -> anyhow::Result<Self> {
-        let stop = Self::default();
-        let asked = stop.clone();
-        ctrlc::set_handler(move || {
-            if asked.0.swap(true, Ordering::Relaxed) {
-                std::process::exit(INTERRUPTED);
-            }
-            log::info!("stopping and saving; Ctrl-C again ends at once");
-        })
-        .context("cannot listen to Ctrl-C")?;
+        Self::on_ctrl_c_logging("stopping and saving; Ctrl-C again ends at once")
+    }
+
+    /// As [`Self::on_ctrl_c`], for a command that saves nothing.
+    pub(crate) fn on_ctrl_c_logging(message: &'static str) -> anyhow::Result<Self> {
+        let stop = Self { message, ..Self::default() };
+        let interrupted = Arc::new(AtomicBool::new(false));
+        let register = || -> std::io::Result<()> {
+            // Actions of a signal run in the order in which they were registered: the first Ctrl-C only sets the flags.
+            flag::register_conditional_shutdown(SIGINT, INTERRUPTED, interrupted.clone())?;
+            flag::register(SIGINT, interrupted)?;
+            let signals = [SIGINT, SIGTERM].into_iter().chain((!is_ignored(SIGHUP)).then_some(SIGHUP));
+            signals.into_iter().try_for_each(|signal| flag::register(signal, stop.signaled.clone()).map(drop))
+        };
+        register().context("cannot listen to signals")?;
         Ok(stop)
     }
 
-    /// Asks for the end, as Ctrl-C does.
+    /// Asks for the end.
     pub(crate) fn ask(&self) {
-        self.0.store(true, Ordering::Relaxed);
+        self.asked.store(true, Ordering::Relaxed);
     }
 
     /// Whether the end was asked for.
     pub(crate) fn asked(&self) -> bool {
-        self.0.load(Ordering::Relaxed)
+        self.asked.load(Ordering::Relaxed) || self.signaled()
+    }
+
+    /// Whether a signal asked for the end.
+    pub(crate) fn signaled(&self) -> bool {
+        let signaled = self.signaled.load(Ordering::Relaxed);
+        if signaled && !self.logged.swap(true, Ordering::Relaxed) {
+            log::info!("{}", self.message);
+        }
+        signaled
+    }
+}
+
+/// Whether this process was started with the signal ignored, which Linux reports in `/proc`.
+fn is_ignored(signal: i32) -> bool {
+    let Ok(status) = std::fs::read_to_string("/proc/self/status") else { return false };
+    ignores(&status, signal)
+}
+
+/// Reads the mask `SigIgn` of `/proc/self/status`: bit n - 1 stands for signal n.
+fn ignores(status: &str, signal: i32) -> bool {
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    let mask = mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
+    mask.is_some_and(|mask| mask >> (signal - 1) & 1 == 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ignored_signals_are_read_from_the_mask() {
+        let status = |mask: &str| format!("Name:\tfieldrig\nSigBlk:\t0000000000000001\nSigIgn:\t{mask}\nSigCgt:\tff\n");
+        assert!(ignores(&status("0000000000001001"), SIGHUP));
+        assert!(!ignores(&status("0000000000001000"), SIGHUP));
+        assert!(ignores(&status("0000000000001000"), 13));
+        assert!(!ignores("Name:\tfieldrig\n", SIGHUP));
     }
 }

@@ -4,6 +4,7 @@ use crate::config::{Rig, USUAL_SEED};
 use crate::data::{self, Data, DataArgs};
 use crate::exit::{BadArgument, LackOfEvidence};
 use crate::method::{self, Kind, Recipe};
+use crate::recovery::Recoveries;
 use crate::session::{Evaluators, Limits, Session, Tell};
 use crate::stop::Stop;
 use crate::training_args::{Evidence, HowMany, Refine, Refining, TrainingArgs};
@@ -67,11 +68,19 @@ pub(crate) fn drive(
         }
     }
     let is_done = |session: &Session| session.is_over() || session.is_idle();
-    while !stop.asked() && !sessions.iter().all(is_done) {
-        turns::take(sessions, |_, _| u64::MAX)?;
-        sessions.iter_mut().filter(|session| session.is_idle()).for_each(Session::rest);
+    let mut recoveries = Recoveries::default();
+    loop {
+        while !stop.asked() && !sessions.iter().all(is_done) {
+            if let Err(error) = turns::take(sessions, |_, _| u64::MAX, || false) {
+                recoveries.recover(sessions, error)?;
+            }
+            sessions.iter_mut().filter(|session| session.is_idle()).for_each(Session::rest);
+        }
+        match sessions.iter().try_for_each(Session::wait) {
+            Ok(()) => return Ok(()),
+            Err(error) => recoveries.recover(sessions, error)?,
+        }
     }
-    Ok(())
 }
 
 /// The scene models: the recording's rig file says which, with the flags over it; a folder has the flags only.

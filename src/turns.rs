@@ -11,8 +11,13 @@ pub(crate) const TURN: Duration = Duration::from_millis(40);
 
 /// Lets the model learn that had the least time of those that can, then tells what is due of all.
 ///
-/// `n_most`: most steps of a session now, by its place among them.
-pub(crate) fn take(sessions: &mut [Session], n_most: impl Fn(usize, &Session) -> u64) -> anyhow::Result<()> {
+/// `n_most`: most steps of a session now, by its place among them. `is_awaited`: whether somebody waits for the turn's end, which
+/// then comes after the submit under way.
+pub(crate) fn take(
+    sessions: &mut [Session],
+    n_most: impl Fn(usize, &Session) -> u64,
+    is_awaited: impl Fn() -> bool,
+) -> anyhow::Result<()> {
     let learns = |ix: usize, session: &Session| !session.is_over() && !session.is_idle() && n_most(ix, session) > 0;
     let had: Vec<Option<Duration>> =
         sessions.iter().enumerate().map(|(ix, session)| learns(ix, session).then(|| session.had())).collect();
@@ -22,7 +27,7 @@ pub(crate) fn take(sessions: &mut [Session], n_most: impl Fn(usize, &Session) ->
         } else {
             // Who had nothing to learn for a while does not catch up on that.
             sessions.iter_mut().for_each(|session| session.had_at_least(least));
-            sessions[ix].take_turn(|session| n_most(ix, session))?;
+            sessions[ix].take_turn(|session| n_most(ix, session), is_awaited)?;
         }
     }
     sessions.iter_mut().try_for_each(Session::tell_due)

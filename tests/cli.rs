@@ -4,8 +4,9 @@ use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
 /// Commands that `fieldrig --help` must list, each with help of its own.
-const COMMANDS: [&str; 13] = [
-    "run", "record", "train", "render", "eval", "metrics", "bench", "export", "fk", "devices", "doctor", "sim", "move",
+const COMMANDS: [&str; 14] = [
+    "run", "record", "train", "view", "render", "eval", "metrics", "bench", "export", "fk", "devices", "doctor", "sim",
+    "move",
 ];
 
 fn fieldrig(args: &[&str]) -> Output {

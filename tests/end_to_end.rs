@@ -2,6 +2,8 @@
 
 #![cfg(feature = "sim")]
 
+mod small_rig;
+
 use serde_json::Value;
 use std::io::{BufRead, BufReader};
 use std::path::Path;
@@ -9,8 +11,6 @@ use std::process::{Command, Output, Stdio};
 
 /// Images the simulated camera delivers.
 const N_IMAGES: i64 = 40;
-/// How many times smaller than in the shipped rig file its images are along each side.
-const SMALLER: i64 = 4;
 /// Steps of every run here.
 const N_STEPS: &str = "300";
 /// Measured 22.1 dB after these few steps, most of them coarse ones; the first keyframe's seeds alone score 16.4 dB.
@@ -24,27 +24,10 @@ fn rig_file(folder: &Path) {
 }
 
 fn rig_file_for(folder: &Path, n_images: i64) {
-    let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
-    let text = std::fs::read_to_string(rigs.join("static-arm.toml")).expect("a shipped rig file");
-    let mut rig: toml::Table = text.parse().expect("TOML");
-    let urdf = rig["arm"]["urdf"].as_str().expect("a robot").to_owned();
-    std::fs::create_dir_all(folder.join(&urdf).parent().expect("inside the folder")).expect("room on the disk");
-    std::fs::copy(rigs.join(&urdf), folder.join(&urdf)).expect("the robot's description");
-    let wrist = rig["camera"]["wrist"].as_table_mut().expect("a camera");
-    for (table, key) in [("", "size_px"), ("intrinsics", "focal_px"), ("intrinsics", "principal_px")] {
-        let holder = if table.is_empty() { &mut *wrist } else { wrist[table].as_table_mut().expect("a table") };
-        for number in holder[key].as_array_mut().expect("two numbers") {
-            *number = match &*number {
-                toml::Value::Integer(whole) => toml::Value::Integer(whole / SMALLER),
-                other => toml::Value::Float(other.as_float().expect("a number") / SMALLER as f64),
-            };
-        }
-    }
-    let sim = rig["sim"].as_table_mut().expect("a simulation");
-    sim.insert("ideal".into(), true.into());
-    sim.insert("lockstep".into(), true.into());
-    sim.insert("n_images".into(), n_images.into());
-    std::fs::write(folder.join("rig.toml"), rig.to_string()).expect("room on the disk");
+    small_rig::write_with(folder, |sim| {
+        sim.insert("lockstep".into(), true.into());
+        sim.insert("n_images".into(), n_images.into());
+    });
 }
 
 fn fieldrig(folder: &Path, args: &[&str]) -> Output {
@@ -97,6 +80,37 @@ fn a_simulated_run_learns_and_its_recording_gives_the_same_bits() {
     scores_a_saved_model_alike(folder, psnr);
     draws_a_saved_model(folder);
     tells_what_a_cut_off_recording_lost(folder);
+}
+
+#[test]
+fn memory_of_a_run_is_measured_with_a_viewer() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    rig_file(folder);
+    let small = std::fs::read_to_string(folder.join("rig.toml")).expect("a rig file") + "\n[join]\nmax_keyframes = 8\n";
+    std::fs::write(folder.join("rig.toml"), small).expect("room on the disk");
+    let bench = ["bench", "memory", "rig.toml", "--sim", "--seconds", "20", "--every-secs", "0.2", "--json"];
+    let told = events(
+        folder,
+        &[&bench[..], &["--out", "memory", "--", "--max-splats", "2000", "--steps-per-keyframe", "1"]].concat(),
+    );
+    assert_eq!(told[0]["event"], "serving");
+    let samples: Vec<&Value> =
+        told.iter().filter(|event| event["event"] == "sample").map(|event| &event["sample"]).collect();
+    assert!(samples.len() >= 3, "{}", samples.len());
+    let (first, last) = (samples[0], samples[samples.len() - 1]);
+    assert!(number(last, "pictures") >= 1.0 && number(last, "viewers") == 1.0, "{last}");
+    assert!(number(last, "step") > number(first, "step"), "{first} {last}");
+    assert!(number(last, "keyframes") <= 8.0 && number(last, "evicted") > 0.0, "{last}");
+    // Color, depth and truth of so many images of 160x120.
+    assert_eq!(number(last, "keyframe_bytes"), number(last, "keyframes") * 160.0 * 120.0 * 12.0);
+    assert!(number(last, "model_bytes") > 0.0 && number(last, "model_bytes") < number(last, "gpu_bytes"), "{last}");
+    assert!(number(last, "resident_bytes") > number(last, "keyframe_bytes"), "{last}");
+    for ending in ["json", "svg", "png", "html"] {
+        assert!(folder.join(format!("memory/memory.{ending}")).is_file(), "{ending}");
+    }
+    let left = std::fs::read_dir(folder.join("memory")).expect("a folder").count();
+    assert_eq!(left, 4, "the run's own folder is removed");
 }
 
 /// Keyframes that are fused.

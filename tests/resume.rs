@@ -1,6 +1,8 @@
 //! `fieldrig train --resume`: runs that stopped, or were killed, go on as if they had not.
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
+mod small_rig;
+
 use serde_json::{Value, json};
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
@@ -71,7 +73,14 @@ fn two_halves_give_the_bits_of_the_whole() {
     let [one, other] = ["whole", "both"].map(|run| Checkpoint::read(&folder.join(run).join("training.ckpt")).unwrap());
     assert!(one.state == other.state && one.arrays == other.arrays);
 
-    // Nothing is left to do; what there is, is saved. The folder holds a model and is not written to.
+    // A run that reached its limit reports that, and changes nothing.
+    let finished = train(folder, &["--resume", "both"]).output().unwrap();
+    assert_eq!(finished.status.code(), Some(0), "{}", String::from_utf8_lossy(&finished.stderr));
+    let finished: Value = serde_json::from_slice(&finished.stdout).unwrap();
+    assert_eq!((&finished["event"], &finished["out"]), (&json!("finished"), &json!("both")));
+    assert!(!folder.join("runs").exists());
+
+    // Asked for as many steps again, it saves what there is. The folder holds a model and is not written to.
     let again = done(folder, &["--resume", "both", "--steps", N_STEPS, "--checkpoint-secs", "0"]);
     assert_eq!(again["checkpoint_sha256"], whole["checkpoint_sha256"]);
     let out = folder.join(again["out"].as_str().unwrap());
@@ -88,7 +97,7 @@ fn tells_what_it_cannot_go_on_from(folder: &Path) {
         refused(&train(folder, &["--resume", "half", "--out", "x"]).output().unwrap(), 1)
     };
     assert!(told(&whole[..whole.len() / 2]).contains("cut off"));
-    assert!(told(&[&whole[..8], &[9], &whole[9..]].concat()).contains("version 9 of the format, this program reads 1"));
+    assert!(told(&[&whole[..8], &[9], &whole[9..]].concat()).contains("version 9 of the format, this program reads 2"));
     let mut damaged = whole.clone();
     damaged[whole.len() / 2] ^= 1;
     assert!(told(&damaged).contains("damaged"));
@@ -156,18 +165,17 @@ fn a_run_that_is_killed_again_and_again_ends_with_the_same_bits() {
     let folder = folder.path();
     std::fs::create_dir(folder.join("data")).unwrap();
     dataset(&folder.join("data"));
-    let common = ["--steps", N_STEPS, "--checkpoint-secs", "0.001"];
-    let first = ["--max-splats", "600", "--out", "killed"];
+    let first = ["--max-splats", "600", "--out", "killed", "--steps", N_STEPS, "--checkpoint-secs", "0.001"];
     let whole = done(folder, &["--steps", N_STEPS, "--max-splats", "600", "--out", "whole"]);
 
     let file = folder.join("killed/training.ckpt");
     let changed = || std::fs::metadata(&file).and_then(|about| about.modified()).ok();
-    let resumed = ["--resume", "killed"];
+    let resumed = ["--resume", "killed"]; // No other flag: the limit and the time between checkpoints are in the checkpoint.
     let mut steps = Vec::new();
     for kill in 0..N_KILLS {
         let from = if file.exists() { &resumed[..] } else { &first[..] };
         let before: Option<SystemTime> = changed();
-        let mut run = train(folder, &[from, &common[..]].concat()).stdout(Stdio::null()).spawn().unwrap();
+        let mut run = train(folder, from).stdout(Stdio::null()).spawn().unwrap();
         let spawned = Instant::now();
         while changed() == before && run.try_wait().unwrap().is_none() {
             assert!(spawned.elapsed() < Duration::from_secs(120), "no checkpoint");
@@ -185,7 +193,68 @@ fn a_run_that_is_killed_again_and_again_ends_with_the_same_bits() {
     if folder.join("killed/splats.ply").exists() {
         return; // A machine so fast that it was over before it was killed.
     }
-    let end = done(folder, &[&resumed[..], &common[..]].concat());
+    let end = done(folder, &resumed);
     assert_eq!(end["checkpoint_sha256"], whole["checkpoint_sha256"]);
     assert!(folder.join("killed/splats.ply").exists(), "it went on in its own folder");
+}
+
+/// Kills a live run, continues it, and expects it to end as one run: with its time, its keyframes and more steps.
+#[cfg(feature = "sim")]
+#[test]
+fn a_live_run_that_is_killed_continues_with_its_keyframes_and_its_clock() {
+    const SECONDS: &str = "14";
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    small_rig::write(folder, small_rig::Pace::RealTime);
+    let run = |args: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
+        command.args(["run", "rig.toml", "--json", "--listen", "127.0.0.1:0"]).args(args).current_dir(folder);
+        command
+    };
+    let limits = ["--seconds", SECONDS, "--checkpoint-secs", "0.5", "--max-splats", "3000"];
+    let first = [&["--sim", "--out", "out", "--record", "first.mcap"], &limits[..]].concat();
+    let mut killed = run(&first).stdout(Stdio::null()).spawn().unwrap();
+    let file = folder.join("out/training.ckpt");
+    let spawned = Instant::now();
+    let has_learned = || Checkpoint::read(&file).is_ok_and(|read| read.state["step"].as_u64() > Some(0));
+    while !has_learned() {
+        assert!(spawned.elapsed() < Duration::from_secs(120) && killed.try_wait().unwrap().is_none(), "no checkpoint");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    killed.kill().unwrap();
+    killed.wait().unwrap();
+    let checkpoint = Checkpoint::read(&file).unwrap();
+    let kept = || std::fs::read_dir(folder.join("out/keyframes")).unwrap().count();
+    let n_kept = kept();
+    assert!(n_kept > 4 && !checkpoint.is_finished, "{n_kept} keyframes");
+
+    let output = run(&["--resume", "out"]).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{said}");
+    assert!(said.contains("recorded in first.mcap; this part is not"), "{said}");
+    let told = String::from_utf8(output.stdout).unwrap();
+    let done: Value = serde_json::from_str(told.lines().last().unwrap()).unwrap();
+    assert_eq!((&done["event"], &done["out"]), (&json!("done"), &json!("out")));
+    assert!(done["steps"].as_u64() > checkpoint.state["step"].as_u64(), "{done}");
+    let seconds = done["seconds"].as_f64().unwrap();
+    assert!((14.0..16.0).contains(&seconds), "its clock continued: {seconds} s");
+    let list = std::fs::read_to_string(folder.join("out/keyframes.txt")).unwrap();
+    let stamps = list.lines().filter_map(|line| line.split(' ').nth(1)?.parse::<i64>().ok());
+    assert!(stamps.clone().count() >= n_kept && stamps.is_sorted(), "{list}");
+
+    // It is finished now, and a longer time continues it in a new folder.
+    let finished = run(&["--resume", "out"]).output().unwrap();
+    assert!(finished.status.success());
+    assert!(String::from_utf8_lossy(&finished.stdout).contains("\"finished\""));
+    let more = run(&["--resume", "out", "--seconds", "16", "--out", "more"]).output().unwrap();
+    assert!(more.status.success(), "{}", String::from_utf8_lossy(&more.stderr));
+    assert!(folder.join("more/splats.ply").exists());
+    let refused = |args: &[&str], words: &str| {
+        let output = run(args).output().unwrap();
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(!output.status.success() && said.contains(words), "{args:?}: {said}");
+    };
+    refused(&["--resume", "out", "--seed", "5"], "--seed");
+    std::fs::remove_dir_all(folder.join("out/keyframes")).unwrap();
+    refused(&["--resume", "out", "--seconds", "30", "--out", "x"], "has no keyframes to continue with");
 }

@@ -1,19 +1,38 @@
-//! Looks for the bundled web page; without it the server shows a page that names `make web`.
+//! Looks for the bundled web page and compresses it; without it the server shows a page that names `make web`.
 
-use std::path::Path;
+use flate2::Compression;
+use flate2::write::GzEncoder;
+use std::io::Write;
+use std::path::{Path, PathBuf};
 
 /// What `scripts/build-web.sh` writes.
 const BUNDLE: [&str; 3] = ["web/dist/index.html", "web/dist/app.js", "web/dist/app.css"];
+/// The page of a binary that was built without Node.js.
+const WITHOUT_BUNDLE: [&str; 2] = ["src/without_bundle.html", "src/without_bundle.css"];
 
-fn main() {
+fn main() -> std::io::Result<()> {
     println!("cargo::rustc-check-cfg=cfg(web_bundle)");
     // The bundler touches this file, so that a first bundle is noticed. Naming bundle files that do not
     // exist would make every build a full one.
     println!("cargo::rerun-if-changed=build.rs");
-    if BUNDLE.iter().all(|file| Path::new(file).is_file()) {
+    let has_bundle = BUNDLE.iter().all(|file| Path::new(file).is_file());
+    if has_bundle {
         println!("cargo::rustc-cfg=web_bundle");
-        for file in BUNDLE {
-            println!("cargo::rerun-if-changed={file}");
-        }
     }
+    let files: &[&str] = if has_bundle { &BUNDLE } else { &WITHOUT_BUNDLE };
+    for file in files {
+        println!("cargo::rerun-if-changed={file}");
+        compress(Path::new(file))?;
+    }
+    Ok(())
+}
+
+/// Writes `OUT_DIR/<name>.gz`.
+fn compress(file: &Path) -> std::io::Result<()> {
+    let folder = PathBuf::from(std::env::var_os("OUT_DIR").expect("Cargo sets OUT_DIR"));
+    let name = file.file_name().expect("the path of a file").to_string_lossy();
+    let mut encoder = GzEncoder::new(std::fs::File::create(folder.join(format!("{name}.gz")))?, Compression::best());
+    encoder.write_all(&std::fs::read(file)?)?;
+    encoder.finish()?;
+    Ok(())
 }

@@ -55,12 +55,13 @@ impl Findings {
     /// Prints the tables, or one JSON object.
     pub(crate) fn tell(&self, page: &Path, json: bool) -> anyhow::Result<()> {
         if json {
-            return print::json(&serde_json::json!({ "event": "done", "page": page, "findings": self.numbers }));
+            return print::report_json(&serde_json::json!({ "event": "done", "page": page, "findings": self.numbers }));
         }
         for table in &self.tables {
-            print::line(table.text())?;
+            print::report(table.text());
         }
-        Ok(print::line(format_args!("see {}", page.display()))?)
+        print::report(format_args!("see {}", page.display()));
+        Ok(())
     }
 
     fn page_head(&self) -> String {
@@ -90,7 +91,8 @@ fn write_file(place: &Path, bytes: &[u8]) -> anyhow::Result<()> {
 }
 
 impl Table {
-    fn html(&self) -> String {
+    /// The table and its title for a page.
+    pub(crate) fn html(&self) -> String {
         let row = |cells: &[String], tag: &str| {
             let cells: String = cells.iter().map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell))).collect();
             format!("<tr>{cells}</tr>\n")

@@ -314,10 +314,10 @@ impl<'a> Runs<'a> {
             run: &'a Run,
         }
         if self.args.json {
-            return print::json(&Event { event: "run", kept: is_kept, run });
+            return print::report_json(&Event { event: "run", kept: is_kept, run });
         }
         let (end, kept) = (&run.end, if is_kept { ", done before" } else { "" });
-        Ok(print::line(format_args!(
+        print::report(format_args!(
             "run {} of {}  {:40} {:7.1} s  step {:6}  {:8} primitives  {:7.2} MB  {:.2} dB{kept}",
             self.n_done,
             self.n_all,
@@ -327,7 +327,8 @@ impl<'a> Runs<'a> {
             end.primitives,
             end.bytes as f64 / 1e6,
             run.psnr()
-        ))?)
+        ));
+        Ok(())
     }
 }
 

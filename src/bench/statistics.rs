@@ -46,6 +46,16 @@ pub(crate) fn secs_to(curve: &[(f64, f64)], wanted_db: f64) -> Option<f64> {
     Some(earlier_secs * (secs / earlier_secs).powf(frac))
 }
 
+/// Slope of a line through `(x, y)`: the median of the slopes between all pairs. `None` below two values of x.
+///
+/// Source: Theil 1950, Sen 1968. A few values that lie off do not move it.
+pub(crate) fn slope(points: &[(f64, f64)]) -> Option<f64> {
+    let pairs = points.iter().enumerate().flat_map(|(ix, from)| points[ix + 1..].iter().map(move |to| (from, to)));
+    let slopes: Vec<f64> =
+        pairs.filter(|(from, to)| to.0 != from.0).map(|(from, to)| (to.1 - from.1) / (to.0 - from.0)).collect();
+    median(&slopes)
+}
+
 /// How values between two levels of a disturbance are found.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Between {
@@ -127,5 +137,15 @@ mod tests {
         assert_close(db_per_doubling((1000.0, 20.0), (2000.0, 19.5)), -0.5);
         assert_eq!(db_per_doubling((1000.0, 20.0), (1000.0, 21.0)), None);
         assert_eq!(db_per_doubling((1000.0, 20.0), (900.0, 21.0)), None);
+    }
+
+    #[test]
+    fn a_slope_is_that_of_most_pairs() {
+        let mut points: Vec<(f64, f64)> = (0..50).map(|x| (f64::from(x), 3.0 - 0.25 * f64::from(x))).collect();
+        points[20].1 = 1e6;
+        points[21].1 = -1e6;
+        assert!((slope(&points).expect("many points") + 0.25).abs() < 1e-9);
+        assert_eq!(slope(&[(1.0, 2.0)]), None);
+        assert_eq!(slope(&[(1.0, 2.0), (1.0, 3.0)]), None);
     }
 }

@@ -63,7 +63,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         );
     }
     let images = evaluator.score_all(model.as_mut(), tests.iter())?;
-    warn_of_other_place(&images.iter().map(|image| image.seen_frac).collect::<Vec<_>>());
+    warn_of_other_place(&images.iter().filter_map(|image| image.seen_frac).collect::<Vec<_>>());
     let scores = Scores::mean(&images);
     let is_test = |keyframe: &Keyframe| keyframe.split == Split::Test;
     let names = data.keyframes.iter().zip(data.names).filter(|(keyframe, _)| is_test(keyframe)).map(|(_, name)| name);

@@ -6,6 +6,7 @@ use crate::export::{Written, write_nerfstudio};
 use crate::join::{Join, KeyframeList, Use};
 use crate::method::{self, Kind};
 use crate::open;
+use crate::partial::{self, Partial};
 use crate::print::{self, counted};
 use crate::run_folder;
 use crate::splat_file;
@@ -81,6 +82,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         return Err(BadArgument(format!("--cell-m: {} has no mesh", args.from.display())).into());
     }
     check_file(args)?;
+    partial::remove_on_signals()?;
     match (args.to, contents) {
         (Format::Ply, Contents::Splats) => export_splats(&args.from, splat_file::Format::Ply, &args.out),
         (Format::Spz, Contents::Splats) => export_splats(&args.from, splat_file::Format::Spz, &args.out),
@@ -136,9 +138,11 @@ fn wrong_kind(sentence: &str, args: &Args) -> anyhow::Error {
 /// Checks the splats by reading them before they go out.
 fn export_splats(model: &Path, format: splat_file::Format, out: &Path) -> anyhow::Result<Exit> {
     let splats = splat_file::read(model)?;
+    let partial = Partial::file(out);
     splat_file::write(out, format, &splats)?;
+    partial.keep();
     let n_splats = counted(splats.n_splats() as u64, "splat");
-    print::line(format!("{n_splats} of colour degree {} -> {}", splats.sh_degree, out.display()))?;
+    print::report(format!("{n_splats} of colour degree {} -> {}", splats.sh_degree, out.display()));
     Ok(Exit::Done)
 }
 
@@ -155,13 +159,15 @@ fn export_mesh(args: &Args) -> anyhow::Result<Exit> {
         ))
         .into());
     }
+    let partial = Partial::file(&args.out);
     match args.to {
         Format::Glb => write_glb(&args.out, written)?,
         _ => write_ply(&args.out, written)?,
     }
+    partial.keep();
     let triangles = |mesh: &Mesh| counted(mesh.triangles.len() as u64, "triangle");
     let of_all = if coarser.is_some() { format!(" in place of {}", triangles(&mesh)) } else { String::new() };
-    print::line(format!("{}{of_all} -> {}", triangles(written), args.out.display()))?;
+    print::report(format!("{}{of_all} -> {}", triangles(written), args.out.display()));
     Ok(Exit::Done)
 }
 
@@ -186,7 +192,7 @@ fn export_recording(args: &Args) -> anyhow::Result<Exit> {
     let written = write_nerfstudio(&args.out, keyframes.into_iter())
         .with_context(|| format!("cannot export {}", args.from.display()))?;
     log::info!("{}", join.counts());
-    print::line(format!("{} -> {}", sentence(written), args.out.display()))?;
+    print::report(format!("{} -> {}", sentence(written), args.out.display()));
     let mut losses = join.counts().losses(Use::Watched);
     losses.extend(opened.damage.get().cloned());
     losses.extend(unlisted);

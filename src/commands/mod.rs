@@ -13,9 +13,12 @@ pub(crate) mod render;
 pub(crate) mod run;
 pub(crate) mod sim;
 pub(crate) mod train;
+pub(crate) mod view;
 
+use crate::allocator;
 use crate::cli::Command;
 use crate::exit::{BadArgument, Exit};
+use crate::recovery;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 use trainer::gpu::{Gpu, GpuOptions};
@@ -34,6 +37,7 @@ pub(crate) fn run(command: Command) -> anyhow::Result<Exit> {
         Command::Run(args) => run::run(&args),
         Command::Record(args) => record::run(&args),
         Command::Train(args) => train::run(&args),
+        Command::View(args) => view::run(&args),
         Command::Render(args) => render::run(&args),
         Command::Eval(args) => eval::run(&args),
         Command::Metrics(args) => metrics::run(args).map(|()| Exit::Done),
@@ -49,7 +53,7 @@ pub(crate) fn run(command: Command) -> anyhow::Result<Exit> {
 
 /// Opens the GPU; `FIELDRIG_GPU` says which one of several, `FIELDRIG_GPU_FEATURES=none` does without everything
 /// optional, and `no-matrices` without cooperative matrices.
-fn open_gpu() -> anyhow::Result<Arc<Gpu>> {
+pub(crate) fn open_gpu() -> anyhow::Result<Arc<Gpu>> {
     open_gpu_with(GpuOptions::default())
 }
 
@@ -64,5 +68,13 @@ fn open_gpu_with(options: GpuOptions) -> anyhow::Result<Arc<Gpu>> {
         }
         Err(_) => None,
     };
-    Ok(Gpu::open(&GpuOptions { optional_features, matrices, adapter, ..options })?)
+    recovery::hide_caught_panics();
+    recovery::check_open_for_tests()?;
+    // For tests of running out of memory.
+    let memory_limit_bytes = std::env::var("FIELDRIG_TEST_GPU_BYTES").ok().and_then(|text| text.parse().ok());
+    let gpu = Gpu::open(&GpuOptions { optional_features, matrices, memory_limit_bytes, adapter, ..options })?;
+    if gpu.is_software() {
+        allocator::keep_images_out_of_heaps();
+    }
+    Ok(gpu)
 }

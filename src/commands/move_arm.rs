@@ -98,7 +98,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         let last = mover.follow(&target).inspect_err(|error| {
             if args.json {
                 // What stdout does with it changes nothing.
-                let _ = print::json(&serde_json::json!({ "event": "stopped", "reason": format!("{error:#}") }));
+                let _ = print::report_json(&serde_json::json!({ "event": "stopped", "reason": format!("{error:#}") }));
             }
         })?;
         tell(args, &rig.arm.joints, &target, &last, began)?;
@@ -159,9 +159,10 @@ fn tell(args: &Args, joints: &[String], target: &JointTarget, last: &JointState,
     let (error, seconds) = (apart.fold(0.0, f64::max), clock::now().secs_since(began));
     if args.json {
         let (target, position) = (&target.position[..], &last.position[..]);
-        return print::json(&Arrived { event: "done", joints, target, position, error, seconds });
+        return print::report_json(&Arrived { event: "done", joints, target, position, error, seconds });
     }
-    Ok(print::line(format_args!("arrived after {seconds:.1} s at {}, {error:.5} off at most", told(&last.position)))?)
+    print::report(format_args!("arrived after {seconds:.1} s at {}, {error:.5} off at most", told(&last.position)));
+    Ok(())
 }
 
 fn told(position: &[f64]) -> String {

@@ -6,7 +6,8 @@ use crate::exit::{self, BadArgument, Exit, LackOfEvidence};
 use crate::open::{self, Devices, Opened};
 use crate::print;
 use crate::stop::Stop;
-use drivers::{Image, Sample};
+use drivers::recording::Recording;
+use drivers::{Image, Sample, Source};
 use kinematics::Stamp;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -90,6 +91,20 @@ impl Recorded {
         }
     }
 
+    /// What a reader finds in the file after writing failed; images that devices lost stay counted.
+    fn recounted(self) -> Self {
+        let mut found = Self { event: self.event, out: self.out, ..Self::default() };
+        let mut first: Option<Stamp> = None;
+        if let Ok(mut recording) = Recording::open(&found.out) {
+            while let Ok(Some(sample)) = recording.next_sample() {
+                let since_first = sample.stamp().0 - first.get_or_insert(sample.stamp()).0;
+                found.seconds = found.seconds.max(since_first as f64 * 1e-9);
+                found.count(&sample);
+            }
+        }
+        Self { lost: self.lost, images_lost_by_devices: self.images_lost_by_devices, ..found }
+    }
+
     fn summary(&self) -> String {
         let Self { images, depth_images, joint_states, base_poses, range_scans, .. } = self;
         let mut told = format!("{images} color images, {depth_images} depth images, {joint_states} joint states");
@@ -162,6 +177,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         }
         if let Err(error) = recorder.write(&sample) {
             losses.push(format!("{:#}", anyhow::Error::new(error)));
+            recorded = recorded.recounted();
             break;
         }
         recorded.count(&sample);
@@ -173,6 +189,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         Some(Ok(kept)) => Some(kept.n_samples),
         Some(Err(error)) => {
             losses.push(format!("{:#}", anyhow::Error::new(error)));
+            recorded = recorded.recounted();
             None
         }
         None => None,
@@ -185,9 +202,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         return Err(LackOfEvidence(format!("no sample came, so {} was not written", args.out.display())).into());
     }
     if args.json {
-        print::json(&recorded)?;
+        print::report_json(&recorded)?;
     } else {
-        print::line(format_args!("{:.1} s, {} in {}", recorded.seconds, recorded.summary(), args.out.display()))?;
+        print::report(format_args!("{:.1} s, {} in {}", recorded.seconds, recorded.summary(), args.out.display()));
     }
     losses.extend(recorded.losses());
     losses.extend(recorded.silent(&rig));

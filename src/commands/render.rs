@@ -3,6 +3,7 @@
 use crate::camera_path::{CameraPath, Stand};
 use crate::evaluate::{seen_frac, warn_of_other_place};
 use crate::exit::{BadArgument, Exit};
+use crate::partial::{self, Partial};
 use crate::run_folder::expect_model;
 use crate::{method, print};
 use anyhow::Context;
@@ -104,6 +105,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let requests = path.stands.iter().map(|stand| args.request(stand, size_px)).collect::<Result<Vec<_>, _>>()?;
     expect_model(&args.model)?;
     refuse_pictures(&args.out, requests.len())?;
+    partial::remove_on_signals()?;
     let mut model = method::load(super::open_gpu()?, &args.model)?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make the folder {}", args.out.display()))?;
     let bar = print::bar(Some(requests.len() as u64), "{bar:30} {pos} of {len}", args.json);
@@ -117,14 +119,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         let drawn = Drawn { picture, depth, size_px, draw_ms };
         bar.inc(1);
         if args.json {
-            print::json(&drawn)?;
+            print::report_json(&drawn)?;
         }
     }
     bar.finish_and_clear();
     warn_of_other_place(&seen_fracs);
     if !args.json {
         let n_pictures = print::counted(requests.len() as u64, "picture");
-        print::line(format_args!("{n_pictures} in {}", args.out.display()))?;
+        print::report(format_args!("{n_pictures} in {}", args.out.display()));
     }
     Ok(Exit::Done)
 }
@@ -156,6 +158,7 @@ impl Args {
             }),
             background_srgb: [0.0; 3],
             light_of: None,
+            depth: self.depth,
         })
     }
 }
@@ -177,11 +180,15 @@ fn refuse_pictures(folder: &Path, n: usize) -> Result<(), BadArgument> {
 fn write(folder: &Path, ix: usize, picture: &Picture, with_depth: bool) -> anyhow::Result<(PathBuf, Option<PathBuf>)> {
     let [width, height] = picture.size_px;
     let [file, depth] = files(folder, ix);
+    let partial = Partial::file(&file);
     image::save_buffer(&file, &picture.rgba_srgb, width, height, image::ExtendedColorType::Rgba8)
         .with_context(|| format!("cannot write {}", file.display()))?;
+    partial.keep();
     let depth = with_depth.then_some(depth);
     if let Some(depth) = &depth {
+        let partial = Partial::file(depth);
         write_npy(depth, picture).with_context(|| format!("cannot write {}", depth.display()))?;
+        partial.keep();
     }
     Ok((file, depth))
 }

@@ -1,6 +1,6 @@
 //! `fieldrig run`: devices, join, trainer, picture.
 
-use crate::checkpoints::{CheckpointArgs, Checkpoints};
+use crate::checkpoints::{self, CheckpointArgs, Checkpoints, RunFlags};
 use crate::clock::Clock;
 use crate::config::{ArmDriver, Override, Rig};
 use crate::decisions::{About, DecisionLog, Settings};
@@ -8,28 +8,37 @@ use crate::evaluate::Evaluator;
 use crate::exit::{self, BadArgument, Exit, LackOfEvidence};
 use crate::feed::{Feed, Input};
 use crate::join::{Counts, Join, Refusal, Use};
+use crate::kept_keyframes::KeptKeyframes;
 use crate::live::{Live, LiveOptions, Pace};
-use crate::method::{self, Kind, Recipe};
+use crate::method::{self, Kind, Recipe, Resumed};
+use crate::next_commands::{DataSource, quoted};
 use crate::open::{self, Devices, Opened};
 use crate::print;
+use crate::recovery::{self, GpuGone, Recovery};
 use crate::run_folder::{self, MadeFolders};
-use crate::session::{self, Ending, Evaluators, Limits, Session, Tell};
+use crate::session::{self, Ending, Evaluators, Finished, Limits, Session, Tell};
 use crate::stands::{StandReport, Stands};
 use crate::stop::Stop;
-use crate::training_args::{Evidence, HowMany, Refine, TrainingArgs};
+use crate::training_args::{Evidence, HowMany, REALIGN, Refine, TrainingArgs};
+use crate::viewer::{ShownModel, Viewer};
+use anyhow::Context;
 use drivers::Source;
+use kinematics::Stamp;
 use serde::Serialize;
 use std::collections::BTreeMap;
+use std::io::IsTerminal;
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
+use std::time::Duration;
+use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
 use trainer::splat::SplatOptions;
-use trainer::{Keyframe, Method, Split};
-use viz::{Hub, Server, ServerConfig};
+use trainer::{Keyframe, Split};
+use viz::{Ended, Hub, Server, ServerConfig};
 
 /// Flags of `run`.
-#[derive(Debug, clap::Args)]
+#[derive(Clone, Debug, clap::Args)]
 pub(crate) struct Args {
     /// Cameras, arm and training settings (TOML)
     rig_file: PathBuf,
@@ -45,7 +54,11 @@ pub(crate) struct Args {
     /// Write everything that comes in to an MCAP file; what devices lose then is a loss (exit code 3), else the next image does
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
-    /// Stop after S seconds, counted from the first image [default: run until Ctrl-C]
+    /// Continue a run that crashed or was stopped, from the checkpoint and the keyframes in its folder, with its flags: no other flag
+    /// is needed. What the robot sees from now on is added
+    #[arg(long, value_name = "FOLDER", conflicts_with_all = ["from", "method", "seed", "max_bytes", "max_splats", "refine", "count"])]
+    resume: Option<PathBuf>,
+    /// Stop after S seconds, counted from the first image, those before --resume included [default: run until Ctrl-C]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
     /// Stop after N optimiser steps, or when the devices ended and there is nothing left to fuse; in lockstep one seed gives one
@@ -66,15 +79,39 @@ pub(crate) struct Args {
     out: Option<PathBuf>,
     #[command(flatten)]
     checkpoints: CheckpointArgs,
+    /// Whether the page stays until Ctrl-C after the run has reached its limit, or the program exits [default: stay on a terminal
+    /// without --json, else exit]
+    #[arg(long, value_name = "WHAT")]
+    when_done: Option<WhenDone>,
     /// Print one JSON object a line
     #[arg(long)]
     json: bool,
 }
 
-fn address(text: &str) -> Result<SocketAddr, String> {
+/// What follows a run that has reached its limit.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum WhenDone {
+    /// Show the model on the page until Ctrl-C.
+    Stay,
+    /// End.
+    Exit,
+}
+
+/// Reads an address of the page.
+pub(super) fn address(text: &str) -> Result<SocketAddr, String> {
     text.parse().map_err(|_| "expected an address and a port, such as 127.0.0.1:7007".to_owned())
 }
 
+/// Names of flags in checkpoints.
+const SECONDS: &str = "seconds";
+const STEPS: &str = "steps";
+const STEPS_PER_KEYFRAME: &str = "steps-per-keyframe";
+const SIM: &str = "sim";
+const LOCKSTEP: &str = "lockstep";
+const RECORD: &str = "record";
+
+/// Time in which connected clients receive the last status.
+const LAST_STATUS: Duration = Duration::from_millis(400);
 /// Steps between two keyframes where no flag says.
 const USUAL_STEPS_PER_KEYFRAME: u64 = 10;
 /// People look on while a mark is scored: it must not take long.
@@ -108,11 +145,105 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 fn drive(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
+    let earlier = args.resume.as_deref().map(Earlier::read).transpose()?;
+    if let Some(earlier) = &earlier
+        && args.is_finished(earlier)
+    {
+        return args.report_finished(earlier);
+    }
+    let args = &earlier.as_ref().map_or_else(|| args.clone(), |earlier| args.with_flags_of(earlier));
+    let mut running = start(args, earlier.as_ref(), made)?;
+    let ended = loop {
+        match running.take_turn() {
+            Ok(true) => {}
+            Ok(false) => match running.live.wait() {
+                Ok(false) => break Ok(()),
+                Ok(true) => {} // The model may lack steps again.
+                Err(error) => break Err(error),
+            },
+            Err(error) => break Err(error),
+        }
+    };
+    let Running { live, rig, folders, damage, stop, server, .. } = running;
+    let hub = live.hub();
+    if let Err(error) = ended {
+        stop.ask();
+        return Err(keep_input(live, &folders, error));
+    }
+    if live.is_through() {
+        log::info!("the devices ended, and all they told is in the model: no step is left to make");
+    }
+    stop.ask();
+    let (exit, models) = save(live, args, &rig, folders, &damage)?;
+    if args.stays() && !models.is_empty() && !stop.signaled() {
+        print::report(format_args!("the page stays at {} until Ctrl-C", server.url()));
+        let shown = |Finished { kind, method, .. }| ShownModel { kind, method };
+        Viewer::new(models.into_iter().map(shown).collect(), hub).serve(&stop);
+    }
+    Ok(exit)
+}
+
+/// Reports the end of a run to its page.
+fn publish_end(hub: &Hub, models: &[Finished]) {
+    let name = |model: &Finished| match models.len() {
+        1 => model.scores.to_string(),
+        _ => format!("{} {}", model.kind.name(), model.scores),
+    };
+    let folder = |model: &Finished| {
+        match models.len() {
+            1 => model.folder.as_path(),
+            _ => model.folder.parent().unwrap_or(&model.folder),
+        }
+        .display()
+        .to_string()
+    };
+    hub.set_ended(Ended {
+        folder: models.first().map(folder),
+        scores: models.iter().map(name).collect::<Vec<_>>().join("; "),
+        seconds: models.iter().map(|model| model.seconds).fold(0.0, f64::max),
+    });
+    if hub.n_clients() > 0 {
+        std::thread::sleep(LAST_STATUS); // Clients show it also after the server has stopped.
+    }
+}
+
+/// A run whose devices are open.
+pub(super) struct Running {
+    pub(super) live: Live,
+    pub(super) gpu: Arc<Gpu>,
+    pub(super) server: Server,
+    stop: Stop,
+    rig: Rig,
+    folders: Vec<PathBuf>,
+    damage: Arc<OnceLock<String>>,
+}
+
+impl Running {
+    /// Takes keyframes, trains a slice, draws and publishes the status; returns `false` once the run is over or was interrupted.
+    pub(super) fn take_turn(&mut self) -> anyhow::Result<bool> {
+        if self.stop.asked() || self.live.is_over() {
+            return Ok(false);
+        }
+        self.live.advance()?;
+        Ok(true)
+    }
+
+    /// Closes the devices without saving anything; returns why they ended too early, if they did.
+    pub(super) fn discard(self) -> anyhow::Result<Option<drivers::Error>> {
+        self.stop.ask();
+        Ok(self.live.finish().1?.input_error)
+    }
+}
+
+/// Opens the devices, the GPU and the page; with `earlier`, to continue that run.
+pub(super) fn start(args: &Args, earlier: Option<&Earlier>, made: &mut MadeFolders) -> anyhow::Result<Running> {
     if let Some(out) = &args.out {
         run_folder::refuse_model(out)?;
     }
     let stop = Stop::on_ctrl_c()?;
-    let rig = Rig::load(&args.rig_file, &args.overrides())?;
+    let mut overrides = args.overrides();
+    overrides.extend(earlier.map(Earlier::overrides).into_iter().flatten());
+    let rig = Rig::load(&args.rig_file, &overrides)?;
     let kinds = rig.train.methods.clone();
     args.training.check_for(&kinds)?;
     let evidence = Evidence { joints: true, drifts: rig.has_moving_base(), depth: false }; // Depth comes, but not at the start.
@@ -122,15 +253,26 @@ fn drive(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
     let options = SplatOptions { cameras, count, ..method::options(&rig.train, args.steps)? };
     let pace = args.pace(&rig)?;
     let gpu = super::open_gpu()?;
-    let start = |kind: &Kind| Recipe { kind: *kind, options: options.clone() }.start(gpu.clone());
-    let methods: Vec<Box<dyn Method>> = kinds.iter().map(start).collect::<anyhow::Result<_>>()?;
+    let models: Vec<Resumed> = match earlier {
+        Some(earlier) => vec![method::resume(gpu.clone(), &earlier.checkpoint, &earlier.keyframes)?],
+        None => {
+            let start = |kind: &Kind| {
+                let recipe = Recipe { kind: *kind, options: options.clone() };
+                let method = recipe.clone().start(gpu.clone())?;
+                Ok(Resumed { recipe, method, rest: Vec::new() })
+            };
+            kinds.iter().map(start).collect::<anyhow::Result<_>>()?
+        }
+    };
     let hub = Hub::new();
     let server = Server::start(ServerConfig { listen: args.listen }, hub.clone())?;
     args.tell_address(&server.url())?;
 
     let Opened { rig, source, damage } = args.open(rig)?;
-    let folders = made.make_each(args.out.as_deref(), &kinds, Some(&rig))?;
-    let feed = Feed::start(args.input(&rig, source)?, hub.clone(), stop.clone())?;
+    let folders = made.make_each(args.out(), &kinds, Some(&rig))?;
+    let held = earlier.map_or(&[][..], |earlier| &earlier.keyframes);
+    let (input, evicted) = args.input(&rig, source, held)?;
+    let feed = Feed::start(input, hub.clone(), stop.clone())?;
     let notes = notes(&gpu);
     let evaluators = Evaluators {
         at_marks: Evaluator::psnr_only(),
@@ -140,45 +282,96 @@ fn drive(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
     let limits = Limits { seconds: args.seconds, steps: args.steps };
     let clock = Clock::default();
     let mut sessions = Vec::new();
-    for ((kind, method), folder) in kinds.iter().copied().zip(methods).zip(&folders) {
+    for (Resumed { recipe: Recipe { kind, options }, mut method, rest }, folder) in models.into_iter().zip(&folders) {
+        let from_step = earlier.is_some().then(|| method.n_taken()).transpose()?;
         let about = About {
             method: kind.name(),
             data: args.record.as_deref().or(args.from.as_deref()),
             adapter: gpu.describe(),
             scale: rig.train.scale,
             depth_from: None,
-            from_step: None,
+            from_step,
             options: options.clone(),
         };
-        let decisions = DecisionLog::create(folder, Settings::new(about))?;
+        let settings = Settings::new(about);
+        let mut decisions = DecisionLog::create(folder, settings.clone())?;
+        let is_new = |keyframe: &Arc<Keyframe>| rest.iter().any(|other| Arc::ptr_eq(other, keyframe));
+        for keyframe in held.iter().filter(|keyframe| !is_new(keyframe)) {
+            decisions.had(from_step.unwrap_or_default(), keyframe);
+        }
+        let recovery = Recovery {
+            recipe: Recipe { kind, options },
+            folder: folder.clone(),
+            resumed: earlier.map(|earlier| earlier.folder.clone()),
+            known: Vec::new(), // The session holds all.
+            settings,
+            resume_command: args.resume_command(folder),
+        };
         let tell = Tell::of_command(args.json);
+        let checkpoints = Checkpoints::new(folder, args.checkpoints);
+        let run_flags = RunFlags { depth_from: None, flags: args.flags(limits) };
         let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, tell)
             .with_stop(&stop)
-            .with_checkpoints(Checkpoints::new(folder, args.checkpoints))
-            .with_decisions(decisions);
-        sessions.push(if kinds.len() == 1 { session } else { session.among_others(clock.clone()) });
+            .with_stepwise_scoring()
+            .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags).with_keyframes(folder)))
+            .with_decisions(decisions)
+            .with_data(args.data_source(folder))
+            .with_recovery(recovery);
+        let mut session = match earlier {
+            Some(earlier) => session.going_on_after(earlier.checkpoint.seconds),
+            None if kinds.len() == 1 => session,
+            None => session.among_others(clock.clone()),
+        };
+        for keyframe in held {
+            if is_new(keyframe) { session.push(keyframe)? } else { session.hold(keyframe) }
+        }
+        for (camera, stamp) in &evicted {
+            session.remove(camera, *stamp)?;
+        }
+        sessions.push(session);
     }
     let options = LiveOptions { pace, start_keyframes: rig.join.start_keyframes, notes };
 
-    let mut live = Live::new(sessions, feed, hub, options);
-    while !stop.asked() && !live.is_over() {
-        live.take_keyframes()?;
-        live.step()?;
-        live.render();
-        live.publish()?;
+    let held = sessions.first().map_or(Vec::new(), |session| session.keyframes().to_vec());
+    let live = Live::new(sessions, feed, hub, options).after(held);
+    Ok(Running { live, gpu, server, stop, rig, folders, damage })
+}
+
+/// Closes the recording and writes the lists of keyframes where training cannot continue; the error says what is left.
+fn keep_input(mut live: Live, folders: &[PathBuf], error: anyhow::Error) -> anyhow::Error {
+    let left = live.what_is_left();
+    let (sessions, leftover) = live.finish();
+    for (session, folder) in sessions.iter().zip(folders) {
+        if let Err(error) = run_folder::write_keyframe_list(&folder.join("keyframes.txt"), session.keyframes()) {
+            log::error!("{error:#}");
+        }
     }
-    if live.is_through() {
-        log::info!("the devices ended, and all they told is in the model: no step is left to make");
+    match leftover {
+        Ok(leftover) => {
+            log::info!("{}", leftover.join.counts());
+            if let Some(error) = leftover.recording_error {
+                log::error!("the recording is cut off: {error:#}");
+            }
+        }
+        Err(error) => log::error!("{error:#}"),
     }
-    stop.ask();
-    save(live, args, &rig, folders, &damage)
+    let is_said = left.is_empty() || error.is::<GpuGone>();
+    if is_said { error } else { error.context(format!("the run broke off; {left}")) }
 }
 
 /// Saves what there is, then tells what went wrong on the way.
-fn save(live: Live, args: &Args, rig: &Rig, folders: Vec<PathBuf>, damage: &OnceLock<String>) -> anyhow::Result<Exit> {
+fn save(
+    mut live: Live,
+    args: &Args,
+    rig: &Rig,
+    folders: Vec<PathBuf>,
+    damage: &OnceLock<String>,
+) -> anyhow::Result<(Exit, Vec<Finished>)> {
+    let hub = live.hub();
     let n_keyframes = live.keyframes().len();
     let n_train = live.keyframes().iter().filter(|keyframe| keyframe.split == Split::Train).count();
     let live_error_m = worst_position_error_m(live.keyframes());
+    let left = live.what_is_left();
     let (sessions, leftover) = live.finish();
     let leftover = leftover?;
     // A disk that has no room for these may have some for the models.
@@ -210,9 +403,12 @@ fn save(live: Live, args: &Args, rig: &Rig, folders: Vec<PathBuf>, damage: &Once
         session,
         out,
     };
+    let mut models = Vec::new();
     if n_train > 0 {
-        session::finish(sessions.into_iter().zip(folders).map(ending).collect())?;
+        let finished = session::finish(sessions.into_iter().zip(folders).map(ending).collect());
+        models = finished.map_err(|error| recovery::with_what_is_left(error, &left))?;
     }
+    publish_end(&hub, &models);
     listed?;
     if let Some(error) = leftover.input_error {
         return Err(anyhow::Error::new(error).context("the devices broke off"));
@@ -220,7 +416,42 @@ fn save(live: Live, args: &Args, rig: &Rig, folders: Vec<PathBuf>, damage: &Once
     if n_train == 0 {
         return Err(LackOfEvidence(nothing_to_train(n_keyframes, counts, rig)).into());
     }
-    Ok(exit::after(&losses))
+    Ok((exit::after(&losses), models))
+}
+
+/// Camera and stamp of a keyframe that found no room.
+type Evicted = (Arc<str>, Stamp);
+
+/// A run to be continued.
+pub(super) struct Earlier {
+    folder: PathBuf,
+    checkpoint: Checkpoint,
+    /// Those it held, in the order of their stamps.
+    keyframes: Vec<Arc<Keyframe>>,
+}
+
+impl Earlier {
+    fn read(folder: &Path) -> anyhow::Result<Self> {
+        let checkpoint = checkpoints::read(folder)?;
+        let kept = KeptKeyframes::of_run(folder).read();
+        let keyframes = kept.with_context(|| {
+            format!("the run in {} has no keyframes to continue with; `train` continues from data", folder.display())
+        })?;
+        log::info!(
+            "continuing the run in {} after {:.1} s, with {}",
+            folder.display(),
+            checkpoint.seconds,
+            print::counted(keyframes.len() as u64, "keyframe")
+        );
+        Ok(Self { folder: folder.to_owned(), checkpoint, keyframes })
+    }
+
+    /// What of the rig file was settled by the flags of that run.
+    fn overrides(&self) -> Vec<Override> {
+        let realign = self.checkpoint.flags.get(REALIGN).map(|is_on| Override::new(REALIGN, is_on == "true"));
+        let method = Kind::named(&self.checkpoint.method).map(|kind| Override::new("train.method", kind.name()));
+        realign.into_iter().chain(method).collect()
+    }
 }
 
 impl Args {
@@ -232,11 +463,93 @@ impl Args {
         overrides
     }
 
+    /// Whether the page outlives the run.
+    fn stays(&self) -> bool {
+        let is_watched = !self.json && std::io::stdout().is_terminal();
+        self.when_done.map_or(is_watched, |when_done| when_done == WhenDone::Stay)
+    }
+
+    /// The flags that a resumed run finds in the checkpoint: values by names.
+    fn flags(&self, limits: Limits) -> BTreeMap<String, String> {
+        let is_on = |flag: bool| flag.then(|| true.to_string());
+        let given = [
+            (SECONDS, limits.seconds.map(|seconds| seconds.to_string())),
+            (STEPS, limits.steps.map(|steps| steps.to_string())),
+            (STEPS_PER_KEYFRAME, self.steps_per_keyframe.map(|n| n.to_string())),
+            (SIM, is_on(self.sim)),
+            (LOCKSTEP, is_on(self.lockstep)),
+            (RECORD, self.record.as_ref().map(|file| file.display().to_string())),
+            (REALIGN, self.training.realign().map(|is_on| is_on.to_string())),
+        ];
+        let flags = given.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?)));
+        flags.chain(self.checkpoints.flag()).collect()
+    }
+
+    /// These flags, and where they are not given those of the run that is resumed.
+    fn with_flags_of(&self, earlier: &Earlier) -> Self {
+        let flag = |name: &str| earlier.checkpoint.flags.get(name);
+        let has_limit = self.seconds.is_some() || self.steps.is_some();
+        let limit = |name: &str| flag(name).filter(|_| !has_limit);
+        if let (Some(file), None) = (flag(RECORD), &self.record) {
+            log::warn!("the first part was recorded in {file}; this part is not, unless --record names another file");
+        }
+        Self {
+            seconds: self.seconds.or_else(|| limit(SECONDS)?.parse().ok()),
+            steps: self.steps.or_else(|| limit(STEPS)?.parse().ok()),
+            steps_per_keyframe: self.steps_per_keyframe.or_else(|| flag(STEPS_PER_KEYFRAME)?.parse().ok()),
+            sim: self.sim || flag(SIM).is_some(),
+            lockstep: self.lockstep || flag(LOCKSTEP).is_some(),
+            checkpoints: self.checkpoints.or_earlier(&earlier.checkpoint.flags),
+            ..self.clone()
+        }
+    }
+
+    /// Whether the run to be resumed reached its limit and saved its model, and no flag asks for more.
+    fn is_finished(&self, earlier: &Earlier) -> bool {
+        let asks_for_more = self.seconds.is_some() || self.steps.is_some();
+        let has_model = || run_folder::refuse_model(&earlier.folder).is_err();
+        earlier.checkpoint.is_finished && !asks_for_more && has_model()
+    }
+
+    fn report_finished(&self, earlier: &Earlier) -> anyhow::Result<Exit> {
+        let (folder, seconds) = (&earlier.folder, earlier.checkpoint.seconds);
+        if self.json {
+            print::report_json(&serde_json::json!({ "event": "finished", "seconds": seconds, "out": folder }))?;
+        } else {
+            print::report(format_args!(
+                "nothing left to do: the run in {} is finished ({seconds:.1} s) and its model is saved there; a larger --steps or \
+                 --seconds continues it",
+                folder.display()
+            ));
+        }
+        Ok(Exit::Done)
+    }
+
+    /// The folder asked for; a run that was cut off continues in its own.
+    fn out(&self) -> Option<&Path> {
+        let unfinished = || self.resume.as_deref().filter(|folder| run_folder::refuse_model(folder).is_ok());
+        self.out.as_deref().or_else(unfinished)
+    }
+
+    /// What to type to continue the run in a folder.
+    fn resume_command(&self, folder: &Path) -> String {
+        let [rig, folder] = [&*self.rig_file, folder].map(|path| quoted(&path.to_string_lossy()));
+        format!("fieldrig run {rig} --resume {folder}")
+    }
+
+    /// What `eval` needs to score the model in `folder` on the images of this run.
+    fn data_source(&self, folder: &Path) -> DataSource {
+        let path = self.record.as_ref().or(self.from.as_ref()).cloned();
+        let rig = folder.join(drivers::recording::RIG_FILE).display().to_string();
+        DataSource { path, flags: vec!["--rig".to_owned(), rig], ..DataSource::default() }
+    }
+
     fn tell_address(&self, url: &str) -> anyhow::Result<()> {
         if self.json {
-            return print::json(&serde_json::json!({ "event": "serving", "url": url }));
+            return print::report_json(&serde_json::json!({ "event": "serving", "url": url }));
         }
-        Ok(print::line(format_args!("open {url} in a browser"))?)
+        print::report(format_args!("open {url} in a browser"));
+        Ok(())
     }
 
     fn open(&self, rig: Rig) -> anyhow::Result<Opened> {
@@ -246,18 +559,27 @@ impl Args {
         }
     }
 
-    fn input(&self, rig: &Rig, source: Box<dyn Source>) -> anyhow::Result<Input> {
-        Ok(Input {
+    /// What goes in, after the keyframes of an earlier run; and those of them that have no room any more.
+    fn input(
+        &self,
+        rig: &Rig,
+        source: Box<dyn Source>,
+        earlier: &[Arc<Keyframe>],
+    ) -> anyhow::Result<(Input, Vec<Evicted>)> {
+        let (join, evicted) = Join::new(rig)?.after(earlier);
+        let input = Input {
             source,
-            join: Join::new(rig)?,
-            stands: Stands::new(rig),
+            join,
+            stands: Stands::new(rig).map(|stands| stands.after(earlier)),
             recorder: self.record.as_deref().map(|file| open::recorder(file, rig)).transpose()?,
+            is_live: self.from.is_none(),
             lenses: rig
                 .cameras
                 .iter()
                 .map(|camera| (camera.name.clone(), (camera.intrinsics.focal_px, camera.intrinsics.principal_px)))
                 .collect(),
-        })
+        };
+        Ok((input, evicted))
     }
 
     /// A recording has no clock of its own, a lockstep simulation waits; everything else goes on without us.
@@ -305,14 +627,13 @@ fn worst_position_error_m(keyframes: &[Arc<Keyframe>]) -> Option<f64> {
 }
 
 /// What people at the page should know.
-fn notes(gpu: &Gpu) -> Vec<String> {
+pub(super) fn notes(gpu: &Gpu) -> Vec<String> {
     if gpu.is_software() { vec!["no GPU: kernels run on the CPU, slowly".to_owned()] } else { Vec::new() }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::path::Path;
 
     #[test]
     fn a_run_without_a_model_says_why() {

@@ -1,6 +1,6 @@
 //! `fieldrig train`: a model of a dataset folder or a recording.
 
-use crate::checkpoints::{self, CheckpointArgs, Checkpoints, OfData};
+use crate::checkpoints::{self, CheckpointArgs, Checkpoints, RunFlags};
 use crate::clock::Clock;
 use crate::config::{Override, Rig};
 use crate::corrected_rig;
@@ -10,7 +10,9 @@ use crate::depth_from::{self, DepthSource, DrawnDepth};
 use crate::evaluate::Evaluator;
 use crate::exit::{self, BadArgument, Exit};
 use crate::method::{self, Kind, Recipe, Resumed};
+use crate::next_commands::{DataSource, quoted};
 use crate::print;
+use crate::recovery::{self, Recovery};
 use crate::replay::Replay;
 use crate::run_folder::{self, MadeFolders};
 use crate::session::{self, Ending, Evaluators, Limits, Session, Tell};
@@ -19,6 +21,7 @@ use crate::stop::Stop;
 use crate::training;
 use crate::training_args::{REALIGN, TrainingArgs};
 use serde::Serialize;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -29,16 +32,23 @@ use trainer::{Keyframe, Split};
 
 /// Length of a training where no flag says.
 const USUAL_SECONDS: f64 = 120.0;
+/// Names of flags in checkpoints.
+const SECONDS: &str = "seconds";
+const STEPS: &str = "steps";
+const DEPTH_FROM: &str = "depth-from";
+const LPIPS_WEIGHTS: &str = "lpips-weights";
+const WRITE_RIG: &str = "write-rig";
+const PROFILE: &str = "profile";
 
 /// Flags of `train`.
-#[derive(Debug, clap::Args)]
+#[derive(Clone, Debug, clap::Args)]
 pub(crate) struct Args {
     /// A nerfstudio or TUM RGB-D folder, or a recording (.mcap)
     data: PathBuf,
     #[command(flatten)]
     training: TrainingArgs,
-    /// Go on from the checkpoint that an earlier run left in this folder, with the same data, its settings, and its --scale, --holdout,
-    /// --keyframes and --rig where they are not given
+    /// Continue from the checkpoint that an earlier run left in this folder, on the same data and with the flags of that run: no other
+    /// flag is needed. A flag given here takes the place of the earlier one, such as a larger --steps or --seconds
     #[arg(long, value_name = "FOLDER", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "count", "plan_steps"])]
     resume: Option<PathBuf>,
     /// Repeat what the clock decided in an earlier run, and get the same model: with the settings of the log that it left
@@ -109,19 +119,28 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
     let started = Instant::now();
     let replay = args.replay_decisions.as_deref().map(Replay::load).transpose()?;
-    let limits = match &replay {
-        Some(_) => Limits::default(),
-        None => training::limits(args.seconds, args.steps, USUAL_SECONDS)?,
-    };
+    training::limits(args.seconds, args.steps, USUAL_SECONDS)?; // Refused before anything is read.
     if let Some(out) = &args.out {
         run_folder::refuse_model(out)?;
+        run_folder::refuse_data(out, &args.data)?;
     }
     let stop = Stop::on_ctrl_c()?;
     let checkpoint = args.resume.as_deref().map(checkpoints::read).transpose()?;
     let whose = args.resume.as_deref().map(|folder| format!("the checkpoint in {}", folder.display()));
     if let (Some(checkpoint), Some(whose)) = (&checkpoint, &whose) {
-        refuse_over(limits, checkpoint, whose)?;
+        if args.is_finished(checkpoint) {
+            return args.report_finished(checkpoint);
+        }
+        refuse_over(args.seconds, checkpoint, whose)?;
     }
+    let args = &checkpoint.as_ref().map_or_else(|| args.clone(), |checkpoint| args.with_flags_of(checkpoint));
+    let limits = match (&replay, &checkpoint) {
+        (Some(_), _) => Limits::default(),
+        (None, checkpoint) => {
+            let earlier_secs = checkpoint.as_ref().map_or(0.0, |checkpoint| checkpoint.seconds);
+            training::limits(args.seconds, args.steps, earlier_secs + USUAL_SECONDS)?
+        }
+    };
     let depth_from = args.depth_from.as_deref().map(DepthSource::find).transpose()?;
     let depth_sum = depth_from.as_ref().map(|source| source.sha256.as_str());
     if let Some(replay) = &replay {
@@ -135,9 +154,9 @@ fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
     if let (Some(checkpoint), Some(whose)) = (&checkpoint, &whose) {
         depth_from::check_same(whose, checkpoint.depth_from.as_deref(), depth_sum)?;
         if replay.is_none() {
-            images = images.after(whose, &checkpoint.data_flags)?;
+            images = images.after(whose, &checkpoint.flags)?;
         }
-        realign = checkpoint.data_flags.get(REALIGN).map(|is_on| is_on == "true");
+        realign = checkpoint.flags.get(REALIGN).map(|is_on| is_on == "true");
         overrides.extend(realign.map(|is_on| Override::new(REALIGN, is_on)));
     } else if replay.is_none() {
         training::check_before_data(&args.training, &args.data, &images)?;
@@ -173,7 +192,10 @@ fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
     let folders = made.make_each(args.out(), &kinds, data.rig.as_ref())?;
     let mut flags = images.flags();
     flags.extend(realign.map(|is_on| (REALIGN.to_owned(), is_on.to_string())));
-    let of_data = OfData { depth_from: depth_sum.map(str::to_owned), flags };
+    flags.extend(args.flags(limits));
+    let source =
+        DataSource { path: Some(args.data.clone()), flags: images.flags_of_images(), image_names: data.image_names() };
+    let run_flags = RunFlags { depth_from: depth_sum.map(str::to_owned), flags };
 
     let rest = models[0].rest.clone(); // All begin with the same images; only one alone goes on from a checkpoint.
     let is_rest = |keyframe: &Arc<Keyframe>| rest.iter().any(|other| Arc::ptr_eq(other, keyframe));
@@ -187,11 +209,19 @@ fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
             data: Some(&args.data),
             adapter: gpu.describe(),
             scale: data.rig.as_ref().map(|rig| rig.train.scale).or(images.scale).unwrap_or(1.0),
-            depth_from: of_data.depth_from.clone(),
+            depth_from: run_flags.depth_from.clone(),
             from_step,
             options,
         };
-        let mut decisions = DecisionLog::create(folder, Settings::new(about))?;
+        let recovery = Recovery {
+            recipe: Recipe { kind, options: about.options.clone() },
+            folder: folder.clone(),
+            resumed: args.resume.clone(),
+            known: data.keyframes.iter().filter(|keyframe| !is_rest(keyframe)).cloned().collect(),
+            settings: Settings::new(about),
+            resume_command: args.resume_command(folder),
+        };
+        let mut decisions = DecisionLog::create(folder, recovery.settings.clone())?;
         for keyframe in data.keyframes.iter().filter(|keyframe| !is_rest(keyframe)) {
             decisions.had(from_step.unwrap_or_default(), keyframe);
         }
@@ -199,9 +229,12 @@ fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
         let checkpoints = Checkpoints::new(folder, args.checkpoints);
         let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, tell)
             .with_stop(&stop)
-            .with_checkpoints(checkpoints.map(|to| to.with_data(of_data.clone())))
+            .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags.clone())))
             .with_profile(args.profile)
-            .with_decisions(decisions);
+            .with_decisions(decisions)
+            .with_data(source.clone());
+        // What is repeated is repeated on one device: its log goes by steps.
+        let session = if replay.is_none() { session.with_recovery(recovery) } else { session };
         sessions.push(match (&kinds[..], &checkpoint) {
             ([_], Some(checkpoint)) => session.going_on_after(checkpoint.seconds),
             ([_], None) => session,
@@ -234,16 +267,18 @@ fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
         session,
         out,
     };
-    session::finish(sessions.into_iter().zip(folders).zip(seeds).map(ending).collect())?;
+    let left = recovery::what_is_left(&mut sessions);
+    let finished = session::finish(sessions.into_iter().zip(folders).zip(seeds).map(ending).collect());
+    finished.map_err(|error| recovery::with_what_is_left(error, &left))?;
     if let Some(file) = &args.write_rig {
         write_rig(&Data::rig_as_given(&args.data, &images)?, alignment.as_ref(), file)?;
     }
     Ok(exit::after(&data.losses))
 }
 
-/// Refuses limits in seconds that are over before training goes on.
-fn refuse_over(limits: Limits, checkpoint: &Checkpoint, whose: &str) -> Result<(), BadArgument> {
-    match limits.seconds.filter(|seconds| *seconds <= checkpoint.seconds) {
+/// Refuses a limit in seconds that is over before training continues.
+fn refuse_over(seconds: Option<f64>, checkpoint: &Checkpoint, whose: &str) -> Result<(), BadArgument> {
+    match seconds.filter(|seconds| *seconds <= checkpoint.seconds) {
         Some(seconds) => Err(BadArgument(format!(
             "--seconds {seconds}: {whose} has been trained for {:.1} s, which count too; name more than that",
             checkpoint.seconds
@@ -289,6 +324,76 @@ impl Args {
             Ok(Resumed { recipe, method, rest: data.keyframes.clone() })
         };
         recipes.into_iter().map(begin).collect()
+    }
+
+    /// The flags that a resumed run finds in the checkpoint, beside those of the images: values by names.
+    fn flags(&self, limits: Limits) -> BTreeMap<String, String> {
+        let whole = |file: &PathBuf| file.canonicalize().unwrap_or_else(|_| file.clone()).display().to_string();
+        // The file is yet to be written: what has a whole path is its folder.
+        let to_write =
+            |file: &PathBuf| std::path::absolute(file).unwrap_or_else(|_| file.clone()).display().to_string();
+        let given = [
+            (SECONDS, limits.seconds.map(|seconds| seconds.to_string())),
+            (STEPS, limits.steps.map(|steps| steps.to_string())),
+            (DEPTH_FROM, self.depth_from.as_ref().map(whole)),
+            (LPIPS_WEIGHTS, self.lpips_weights.as_ref().map(whole)),
+            (WRITE_RIG, self.write_rig.as_ref().map(to_write)),
+            (PROFILE, self.profile.then(|| true.to_string())),
+        ];
+        let flags = given.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?)));
+        flags.chain(self.checkpoints.flag()).collect()
+    }
+
+    /// These flags, and where they are not given those of the run that is resumed.
+    fn with_flags_of(&self, checkpoint: &Checkpoint) -> Self {
+        let earlier = |name: &str| checkpoint.flags.get(name);
+        let path = |name: &str| earlier(name).map(PathBuf::from);
+        let has_limit = self.seconds.is_some() || self.steps.is_some();
+        let limit = |name: &str| earlier(name).filter(|_| !has_limit);
+        Self {
+            seconds: self.seconds.or_else(|| limit(SECONDS)?.parse().ok()),
+            steps: self.steps.or_else(|| limit(STEPS)?.parse().ok()),
+            depth_from: self.depth_from.clone().or_else(|| path(DEPTH_FROM)),
+            lpips_weights: self.lpips_weights.clone().or_else(|| path(LPIPS_WEIGHTS)),
+            write_rig: self.write_rig.clone().or_else(|| path(WRITE_RIG)),
+            profile: self.profile || earlier(PROFILE).is_some(),
+            checkpoints: self.checkpoints.or_earlier(&checkpoint.flags),
+            ..self.clone()
+        }
+    }
+
+    /// What to type to continue the training in a folder.
+    fn resume_command(&self, folder: &Path) -> String {
+        let [data, folder] = [&*self.data, folder].map(|path| quoted(&path.to_string_lossy()));
+        format!("fieldrig train {data} --resume {folder}")
+    }
+
+    /// Whether the run to be resumed reached its end and saved its model, and no flag asks for more.
+    fn is_finished(&self, checkpoint: &Checkpoint) -> bool {
+        let asks_for_more = self.seconds.is_some()
+            || self.steps.is_some()
+            || self.replay_decisions.is_some()
+            || !self.images.flags().is_empty();
+        let has_model = || self.resume.as_deref().is_some_and(|folder| run_folder::refuse_model(folder).is_err());
+        checkpoint.is_finished && !asks_for_more && has_model()
+    }
+
+    fn report_finished(&self, checkpoint: &Checkpoint) -> anyhow::Result<Exit> {
+        let folder = self.resume.as_deref().unwrap_or(Path::new(""));
+        let limit = |name| checkpoint.flags.get(name).map(|value| format!("--{name} {value}"));
+        let limits = [limit(STEPS), limit(SECONDS)].into_iter().flatten().collect::<Vec<_>>().join(" ");
+        if self.json {
+            let seconds = checkpoint.seconds;
+            print::report_json(&serde_json::json!({ "event": "finished", "seconds": seconds, "out": folder }))?;
+        } else {
+            print::report(format_args!(
+                "nothing left to do: the run in {} is finished ({limits}, {:.1} s) and its model is saved there; a larger --steps or \
+                 --seconds continues it",
+                folder.display(),
+                checkpoint.seconds
+            ));
+        }
+        Ok(Exit::Done)
     }
 
     /// The folder asked for; a run that was cut off goes on in its own.

@@ -51,6 +51,10 @@ pub(crate) struct Join {
     default_depth_m: f64,
     /// The latest stamp of all samples: the only clock there is.
     newest: Stamp,
+    /// The latest stamp of the keyframes of the run that is resumed.
+    newest_earlier: Option<Stamp>,
+    /// Nanoseconds added to the stamps of new keyframes, so that they come after the earlier ones; none before the first.
+    shift_nanos: Option<i64>,
 }
 
 /// What a sample led to.
@@ -115,6 +119,8 @@ impl Join {
             max_wait_secs: join.max_wait_millis * 1e-3,
             default_depth_m: join.default_depth_m,
             newest: Stamp(i64::MIN),
+            newest_earlier: None,
+            shift_nanos: None,
         })
     }
 
@@ -123,6 +129,23 @@ impl Join {
         self.store = KeyframeStore::new(usize::MAX, u64::MAX, Spacing { translation_m: 1.0, rotation_rad: 1.0 });
         self.list = Some(list);
         self
+    }
+
+    /// Continues a run that had these keyframes; gives those for which the store has no room any more.
+    ///
+    /// Clocks start anew with a simulation or a computer: where the first new keyframe would not come after the earlier ones, the
+    /// stamps of all new ones are shifted.
+    pub(crate) fn after(mut self, keyframes: &[Arc<Keyframe>]) -> (Self, Vec<(Arc<str>, Stamp)>) {
+        let mut evicted = Vec::new();
+        for keyframe in keyframes {
+            if let Some(camera) = self.cameras.iter_mut().find(|camera| camera.config.name == keyframe.camera) {
+                camera.acceptance.accept(keyframe.stamp, &keyframe.world_from_camera);
+                camera.n_accepted += 1;
+            }
+            evicted.extend(self.store.push(Arc::clone(keyframe)));
+        }
+        self.newest_earlier = keyframes.iter().map(|keyframe| keyframe.stamp).max();
+        (self, evicted)
     }
 
     /// Takes in one sample; tells what followed from it.
@@ -285,7 +308,12 @@ impl Join {
         camera.n_accepted += 1;
         self.counts.accepted += 1;
         let of_ranges = if camera.config.depth.is_none() { self.ranges.depth_of(&keyframe) } else { None };
-        let keyframe = Arc::new(Keyframe { depth: keyframe.depth.or(of_ranges), ..keyframe });
+        let shift_nanos = *self.shift_nanos.get_or_insert_with(|| match self.newest_earlier {
+            Some(earlier) if stamp <= earlier => earlier.plus_secs(1.0).0.saturating_sub(stamp.0),
+            _ => 0,
+        });
+        let stamp = Stamp(keyframe.stamp.0.saturating_add(shift_nanos));
+        let keyframe = Arc::new(Keyframe { depth: keyframe.depth.or(of_ranges), stamp, ..keyframe });
         self.counts.without_depth += u64::from(camera.config.depth.is_some() && keyframe.depth.is_none());
         events.push(JoinEvent::Accepted(Arc::clone(&keyframe)));
         for (camera, stamp) in self.store.push(keyframe) {

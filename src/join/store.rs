@@ -47,7 +47,7 @@ impl KeyframeStore {
             kept.nearest = kept.nearest.min(distance);
             nearest = nearest.min(distance);
         }
-        let bytes = bytes_of(&keyframe);
+        let bytes = keyframe.bytes();
         self.bytes += bytes;
         self.kept.push(Kept { keyframe, bytes, nearest });
         let mut gone = Vec::new();
@@ -87,13 +87,6 @@ impl KeyframeStore {
         }
         gone.keyframe
     }
-}
-
-/// Host memory that a keyframe holds.
-fn bytes_of(keyframe: &Keyframe) -> u64 {
-    let depth = keyframe.depth.as_ref().map_or(0, |depth| depth.depth_m.len() * size_of::<f32>());
-    let truth = keyframe.truth.as_ref().map_or(0, |truth| truth.rgba_srgb.len());
-    (keyframe.rgba_srgb.len() + depth + truth) as u64
 }
 
 #[cfg(test)]

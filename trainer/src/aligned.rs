@@ -160,6 +160,14 @@ impl<M: Renewable + 'static> Method for Aligned<M> {
         self.model.render(request)
     }
 
+    fn set_watched(&mut self, watched: bool) {
+        self.model.set_watched(watched);
+    }
+
+    fn psnr(&mut self, request: &RenderRequest, keyframe: &Keyframe) -> Result<Option<f64>, Error> {
+        self.model.psnr(request, keyframe)
+    }
+
     fn depth_stride(&self) -> u32 {
         self.model.depth_stride()
     }

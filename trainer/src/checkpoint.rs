@@ -2,18 +2,17 @@
 //!
 //! `docs/saving.md` describes the layout.
 
-use crate::Error;
+use crate::{Error, whole_file};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::fmt::{Debug, Formatter};
-use std::fs::File;
 use std::io::Write;
 use std::path::Path;
 
 const MAGIC: [u8; 8] = *b"FRIGCKPT";
 /// Of the layout and of what the states of all methods mean.
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 /// Magic, version, and the length of the description.
 const FRONT_BYTES: usize = 16;
 const SUM_BYTES: usize = 32;
@@ -27,8 +26,10 @@ pub struct Checkpoint {
     pub seconds: f64,
     /// SHA-256 of the model that keyframes without depth had theirs drawn from, where there was one.
     pub depth_from: Option<String>,
-    /// Flags that its keyframes were made by, for its caller to make them again: values by names.
-    pub data_flags: BTreeMap<String, String>,
+    /// Flags of the run, for its caller to continue with them: values by names. The limit where training ends is among them.
+    pub flags: BTreeMap<String, String>,
+    /// Whether training had reached its end.
+    pub is_finished: bool,
     /// The method's state but for its arrays.
     pub state: serde_json::Value,
     /// What is too large for a description, little endian.
@@ -56,7 +57,9 @@ struct Description {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     depth_from: Option<String>,
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
-    data_flags: BTreeMap<String, String>,
+    flags: BTreeMap<String, String>,
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    is_finished: bool,
     state: serde_json::Value,
     arrays: Vec<Length>,
 }
@@ -88,28 +91,21 @@ impl Debug for PendingCheckpoint {
 impl Checkpoint {
     /// What a method tells of itself; how long it had been trained for, and on what, is for its caller to say.
     pub(crate) fn new(method: &str, state: serde_json::Value, arrays: Vec<Array>) -> Self {
-        Self { method: method.to_owned(), seconds: 0.0, depth_from: None, data_flags: BTreeMap::new(), state, arrays }
+        Self {
+            method: method.to_owned(),
+            seconds: 0.0,
+            depth_from: None,
+            flags: BTreeMap::new(),
+            is_finished: false,
+            state,
+            arrays,
+        }
     }
 
     /// Writes the file beside its place, waits until the disk has it, and moves it there: whatever happens, either the
     /// previous file or this one is under the name, whole.
     pub fn write(&self, path: &Path) -> Result<(), Error> {
-        let mut partial = path.as_os_str().to_owned();
-        partial.push(".part");
-        let written = File::create(&partial).and_then(|mut file| {
-            self.write_to(&mut file)?;
-            file.sync_all()?;
-            std::fs::rename(&partial, path)?;
-            // The new name is on the disk only when its folder is.
-            match path.parent() {
-                Some(folder) if !folder.as_os_str().is_empty() => File::open(folder)?.sync_all(),
-                _ => File::open(".")?.sync_all(),
-            }
-        });
-        if written.is_err() {
-            let _ = std::fs::remove_file(&partial); // What it holds is of no use, and the model may need its room.
-        }
-        written.map_err(|source| Error::Write { path: path.to_owned(), source })
+        whole_file::write(path, |file| self.write_to(file))
     }
 
     /// Reads a whole file and checks every byte of it.
@@ -138,7 +134,8 @@ impl Checkpoint {
             method: self.method.clone(),
             seconds: self.seconds,
             depth_from: self.depth_from.clone(),
-            data_flags: self.data_flags.clone(),
+            flags: self.flags.clone(),
+            is_finished: self.is_finished,
             state: self.state.clone(),
             arrays: lengths.collect(),
         })?;
@@ -187,8 +184,8 @@ impl Checkpoint {
             arrays.push(Array { name, bytes: array.to_vec() });
             rest = after;
         }
-        let Description { method, seconds, depth_from, data_flags, state, .. } = description;
-        Ok(Self { method, seconds, depth_from, data_flags, state, arrays })
+        let Description { method, seconds, depth_from, flags, is_finished, state, .. } = description;
+        Ok(Self { method, seconds, depth_from, flags, is_finished, state, arrays })
     }
 }
 
@@ -202,7 +199,8 @@ mod tests {
             method: "splat".into(),
             seconds: 0.1 + 0.2,
             depth_from: Some("5ad1".into()),
-            data_flags: BTreeMap::from([("scale".into(), "0.5".into())]),
+            flags: BTreeMap::from([("scale".into(), "0.5".into())]),
+            is_finished: true,
             state: serde_json::json!({ "step": u64::MAX, "size_m": 1.0 / 3.0 }),
             arrays: arrays.map(|(name, bytes)| Array { name: name.into(), bytes }).into(),
         }
@@ -233,7 +231,7 @@ mod tests {
         let empty = Checkpoint::new("m", 7.into(), Vec::new());
         let bytes = bytes_of(&empty);
         let json = r#"{"method":"m","seconds":0.0,"state":7,"arrays":[]}"#;
-        assert_eq!(bytes[..16], *b"FRIGCKPT\x01\0\0\0\x32\0\0\0");
+        assert_eq!(bytes[..16], *b"FRIGCKPT\x02\0\0\0\x32\0\0\0");
         assert_eq!(bytes[16..66], *json.as_bytes());
         assert_eq!(bytes[66..], Sha256::digest(&bytes[..66])[..]);
     }
@@ -252,7 +250,7 @@ mod tests {
             bytes[at] = to;
             complaint(&bytes)
         };
-        assert_eq!(changed(8, 2), "version 2 of the format, this program reads 1");
+        assert_eq!(changed(8, 1), "version 1 of the format, this program reads 2");
         assert_eq!(changed(15, 255), "cut off");
         for at in [20, whole.len() - 40, whole.len() - 1] {
             assert_eq!(changed(at, 0xff), "damaged: its checksum does not match", "byte {at}");

@@ -31,6 +31,20 @@ pub enum Error {
     /// The GPU stopped answering.
     #[error("the GPU stopped answering: its driver reset or lost the device")]
     DeviceLost,
+    /// The GPU has no memory left for a buffer; without a name and a size, for commands or a transfer.
+    #[error(
+        "the GPU ran out of memory{}; close other programs that use it, or lower --max-splats, --max-bytes or the image size",
+        of_buffer(label, *bytes)
+    )]
+    OutOfMemory {
+        /// Name of the buffer.
+        label: String,
+        /// Bytes wanted.
+        bytes: u64,
+    },
+    /// The GPU rejected a command: a bug of ours or of its driver.
+    #[error("the GPU rejected a command: {0}")]
+    Rejected(String),
     /// A buffer past the adapter's limit.
     #[error(
         "buffer {label}: {bytes} bytes are more than this GPU can bind ({limit_bytes} bytes); lower --max-splats, --max-bytes or the image size"
@@ -171,4 +185,20 @@ pub enum Error {
     /// Arrays of splats do not fit together.
     #[error("splats: {0}")]
     SplatArrays(String),
+}
+
+impl Error {
+    /// Whether it is the GPU that failed: on another device the same work may succeed.
+    pub fn is_of_gpu(&self) -> bool {
+        matches!(self, Self::DeviceLost | Self::OutOfMemory { .. } | Self::Rejected(_))
+    }
+
+    /// Whether there is no memory for a buffer as large as was asked for.
+    pub(crate) fn is_of_memory(&self) -> bool {
+        matches!(self, Self::OutOfMemory { .. } | Self::BufferTooLarge { .. })
+    }
+}
+
+fn of_buffer(label: &str, bytes: u64) -> String {
+    if bytes == 0 { String::new() } else { format!(": buffer {label} needs {bytes} bytes") }
 }

@@ -69,6 +69,13 @@ impl Keyframe {
         })
     }
 
+    /// Host memory of its arrays.
+    pub fn bytes(&self) -> u64 {
+        let depth = self.depth.as_ref().map_or(0, |depth| size_of_val(&*depth.depth_m));
+        let truth = self.truth.as_ref().map_or(0, |truth| truth.rgba_srgb.len());
+        (self.rgba_srgb.len() + depth + truth) as u64
+    }
+
     /// Refuses arrays that do not have their pixels.
     pub(crate) fn check(&self) -> Result<(), Error> {
         let [width, height] = self.size_px;

@@ -28,6 +28,7 @@ mod test_data;
 mod test_scenes;
 
 pub mod tsdf;
+pub mod whole_file;
 
 pub use aligned::{Aligned, Renewable, WithRest};
 pub use error::Error;

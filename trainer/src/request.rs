@@ -1,5 +1,6 @@
 //! Requests for pictures of the model, and the pictures.
 
+use crate::gpu::Buffer;
 use kinematics::{Stamp, Transform, Twist};
 use std::sync::Arc;
 
@@ -59,6 +60,8 @@ pub struct RenderRequest {
     /// In the light and with the exposure that this camera had at this time, where the model knows them; `None`: in those of the
     /// mean image.
     pub light_of: Option<(Arc<str>, Stamp)>,
+    /// Whether depth is wanted. Without it [`Picture::depth_m`] is empty, and half as many bytes are read back from the GPU.
+    pub depth: bool,
 }
 
 /// A drawn picture.
@@ -68,16 +71,33 @@ pub struct Picture {
     pub size_px: [u32; 2],
     /// `[height, width, 4]`, sRGB over the background; alpha is coverage.
     pub rgba_srgb: Vec<u8>,
-    /// `[height, width]`, metres along z (distance for equirectangular); 0 where nothing is.
+    /// `[height, width]`, metres along z (distance for equirectangular); 0 where nothing is. Empty where [`RenderRequest::depth`]
+    /// was false.
     pub depth_m: Vec<f32>,
 }
 
 impl Picture {
+    /// What to read back for a picture that was drawn into these buffers; the depths where they are wanted.
+    pub(crate) fn buffers<'a>(
+        size_px: [u32; 2],
+        pixels: &'a Buffer,
+        depths: Option<&'a Buffer>,
+    ) -> Vec<(&'a Buffer, usize)> {
+        let n_bytes = 4 * size_px[0] as usize * size_px[1] as usize;
+        std::iter::once(pixels).chain(depths).map(|buffer| (buffer, n_bytes)).collect()
+    }
+
+    /// The picture from what was read back of [`Self::buffers`].
+    pub(crate) fn of_parts(size_px: [u32; 2], parts: &[&[u8]]) -> Self {
+        let depth_m = parts.get(1).map_or(Vec::new(), |bytes| bytemuck::pod_collect_to_vec(bytes));
+        Self { size_px, rgba_srgb: parts[0].to_vec(), depth_m }
+    }
+
     /// Nothing but background.
-    pub(crate) fn empty(size_px: [u32; 2], background_srgb: [f32; 3]) -> Self {
+    pub(crate) fn empty(size_px: [u32; 2], background_srgb: [f32; 3], depth: bool) -> Self {
         let n = size_px[0] as usize * size_px[1] as usize;
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to 0 to 255")]
         let [red, green, blue] = background_srgb.map(|part| (part.clamp(0.0, 1.0) * 255.0 + 0.5).floor() as u8);
-        Self { size_px, rgba_srgb: [red, green, blue, 0].repeat(n), depth_m: vec![0.0; n] }
+        Self { size_px, rgba_srgb: [red, green, blue, 0].repeat(n), depth_m: vec![0.0; if depth { n } else { 0 }] }
     }
 }

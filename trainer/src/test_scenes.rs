@@ -188,5 +188,6 @@ pub(crate) fn request(world_from_camera: Transform) -> RenderRequest {
         crop: None,
         background_srgb: [0.0, 0.5, 1.0],
         light_of: None,
+        depth: true,
     }
 }

@@ -1,12 +1,12 @@
 //! The meeting place of the training thread and the server; no call of the training thread waits for a client.
 
-use crate::news::{KeyframePose, LiveImage, LiveSlot, SceneHint, Status};
+use crate::news::{Ended, KeyframePose, LiveImage, SceneHint, Status};
 use crate::pose::row_major;
 use crate::protocol::{PictureHeader, ProjectionMessage};
 use crate::queue::{Outgoing, Queue, Ticket};
 use crate::render_order::RenderOrder;
 use std::collections::BTreeMap;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::{Notify, watch};
 use trainer::{Picture, Projection, RenderRequest};
@@ -18,7 +18,7 @@ pub struct Hub {
 }
 
 /// Latest images by camera name.
-pub(crate) type LiveImages = BTreeMap<Arc<str>, Arc<LiveSlot>>;
+pub(crate) type LiveImages = BTreeMap<Arc<str>, Arc<LiveImage>>;
 
 #[derive(Debug, Default)]
 struct Shared {
@@ -41,11 +41,31 @@ impl Hub {
         self.shared.status.send_replace(Some(Arc::new(status.thinned())));
     }
 
+    /// Replaces the state of the latest status and keeps its figures, such as the scores while the model is saved.
+    pub fn set_state(&self, state: &str) {
+        self.change_status(|status| state.clone_into(&mut status.state));
+    }
+
+    /// Reports the result of the run: clients show it, also after the server has stopped.
+    pub fn set_ended(&self, ended: Ended) {
+        self.change_status(|status| {
+            "finished".clone_into(&mut status.state);
+            status.ended = Some(ended);
+        });
+    }
+
+    fn change_status(&self, change: impl FnOnce(&mut Status)) {
+        self.shared.status.send_modify(|latest| {
+            let mut status = latest.as_deref().cloned().unwrap_or_default();
+            change(&mut status);
+            *latest = Some(Arc::new(status));
+        });
+    }
+
     /// Shows what a camera sees. It is encoded later and elsewhere, and only if somebody looks.
     pub fn set_live_image(&self, image: LiveImage) {
-        let slot = Arc::new(LiveSlot { image, jpeg: OnceLock::new() });
         self.shared.live_images.send_modify(|images| {
-            images.insert(Arc::clone(&slot.image.camera), slot);
+            images.insert(Arc::clone(&image.camera), Arc::new(image));
         });
     }
 
@@ -150,6 +170,9 @@ impl PendingRender {
     /// Sends the drawn picture to the client; encoding happens on the server's side.
     pub fn deliver(mut self, picture: Picture) {
         let header = self.header(&picture);
+        if header.last {
+            self.hub.queue().drawn(&self.ticket, header.render_millis);
+        }
         self.answer(Outgoing::Picture(Box::new((self.ticket.clone(), header, picture))));
     }
 

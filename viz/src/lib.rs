@@ -3,8 +3,12 @@
 //! The training thread talks to a [`Hub`], which never makes it wait; a [`Server`] passes what lies in the
 //! hub to browsers over one port, as `docs/protocol.md` tells.
 
+mod admission;
+mod broadcast;
+mod clock;
 mod error;
 mod hub;
+mod jpeg;
 mod news;
 mod page;
 mod picture;
@@ -17,6 +21,6 @@ mod session;
 
 pub use error::Error;
 pub use hub::{Hub, PendingRender};
-pub use news::{KeyframePose, LiveImage, LivePixels, ModelStatus, SceneHint, Status};
+pub use news::{Ended, KeyframePose, LiveImage, LivePixels, ModelStatus, SceneHint, Status};
 pub use protocol::PROTOCOL_VERSION;
 pub use server::{Server, ServerConfig};

@@ -3,7 +3,8 @@
 use kinematics::{Stamp, Transform};
 use serde::Serialize;
 use std::collections::BTreeMap;
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
+use std::time::Instant;
 
 /// Points of the accuracy curve that are kept for the page; a longer curve is thinned evenly.
 const MAX_HISTORY: usize = 512;
@@ -26,6 +27,19 @@ pub struct Status {
     pub others: Vec<ModelStatus>,
     /// Sentences that an operator should read, such as a lost camera.
     pub notes: Vec<String>,
+    /// The result, once the run has ended and its model is saved.
+    pub ended: Option<Ended>,
+}
+
+/// Result of a run that has ended.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Ended {
+    /// Folder of the saved model; `None` if nothing was saved.
+    pub folder: Option<String>,
+    /// Final scores in one line, such as `PSNR 26.76 dB`; empty if there are none.
+    pub scores: String,
+    /// Wall time of the whole run, seconds.
+    pub seconds: f64,
 }
 
 /// Where a model stands.
@@ -91,7 +105,7 @@ pub struct KeyframePose {
 /// Pixels of a live image, sRGB.
 #[derive(Clone, Debug)]
 pub enum LivePixels {
-    /// A whole JPEG file, sent as it is.
+    /// A whole JPEG file; sent unchanged if it is small.
     Jpeg(Arc<[u8]>),
     /// `[height, width, 3]`.
     Rgb(Arc<[u8]>),
@@ -106,6 +120,10 @@ pub struct LiveImage {
     pub camera: Arc<str>,
     /// Mid-exposure.
     pub stamp: Stamp,
+    /// The same moment on this process's clock, from which viewers compute the image's age.
+    ///
+    /// Stamps of recordings and simulations are on other clocks; for them, pass the time at which the image was read.
+    pub captured_at: Instant,
     /// Width and height, pixels.
     pub size_px: [u32; 2],
     /// The image.
@@ -116,15 +134,6 @@ pub struct LiveImage {
     pub focal_px: [f64; 2],
     /// Principal point, pixels.
     pub principal_px: [f64; 2],
-}
-
-/// A live image that is encoded at most once, however many clients look.
-#[derive(Debug)]
-pub(crate) struct LiveSlot {
-    /// The image as it came.
-    pub(crate) image: LiveImage,
-    /// JPEG bytes, or why there are none; filled by the first client that looks.
-    pub(crate) jpeg: OnceLock<Result<Vec<u8>, String>>,
 }
 
 #[cfg(test)]

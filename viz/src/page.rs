@@ -1,32 +1,114 @@
 //! The web page inside the binary.
 
+use axum::http::{HeaderMap, HeaderName, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+
 /// A file of the page.
 pub(crate) struct PageFile {
     /// Path of the URL.
     pub(crate) path: &'static str,
-    /// MIME type.
-    pub(crate) content_type: &'static str,
-    /// The file.
-    pub(crate) bytes: &'static [u8],
+    content_type: &'static str,
+    bytes: &'static [u8],
+    gzip: &'static [u8],
+}
+
+/// A file that `build.rs` has compressed.
+macro_rules! page_file {
+    ($path:literal, $content_type:literal, $folder:literal, $name:literal) => {
+        PageFile {
+            path: $path,
+            content_type: $content_type,
+            bytes: include_bytes!(concat!($folder, $name)),
+            gzip: include_bytes!(concat!(env!("OUT_DIR"), "/", $name, ".gz")),
+        }
+    };
 }
 
 /// The page that `scripts/build-web.sh` bundled.
 #[cfg(web_bundle)]
 pub(crate) const FILES: &[PageFile] = &[
-    PageFile { path: "/", content_type: "text/html; charset=utf-8", bytes: include_bytes!("../web/dist/index.html") },
-    PageFile {
-        path: "/app.js",
-        content_type: "text/javascript; charset=utf-8",
-        bytes: include_bytes!("../web/dist/app.js"),
-    },
-    PageFile {
-        path: "/app.css",
-        content_type: "text/css; charset=utf-8",
-        bytes: include_bytes!("../web/dist/app.css"),
-    },
+    page_file!("/", "text/html; charset=utf-8", "../web/dist/", "index.html"),
+    page_file!("/app.js", "text/javascript; charset=utf-8", "../web/dist/", "app.js"),
+    page_file!("/app.css", "text/css; charset=utf-8", "../web/dist/", "app.css"),
 ];
 
-/// The page of a binary that was built without Node.
+/// The page of a binary that was built without Node.js.
 #[cfg(not(web_bundle))]
-pub(crate) const FILES: &[PageFile] =
-    &[PageFile { path: "/", content_type: "text/html; charset=utf-8", bytes: include_bytes!("without_bundle.html") }];
+pub(crate) const FILES: &[PageFile] = &[
+    page_file!("/", "text/html; charset=utf-8", "", "without_bundle.html"),
+    page_file!("/app.css", "text/css; charset=utf-8", "", "without_bundle.css"),
+];
+
+impl PageFile {
+    /// The response to a GET request: the file, compressed if the client accepts that, or 304 if it has this version.
+    pub(crate) fn response(&self, request: &HeaderMap) -> Response {
+        let etag = self.etag();
+        let shared: [(HeaderName, &str); 3] =
+            [(header::ETAG, &etag), (header::CACHE_CONTROL, "no-cache"), (header::VARY, "accept-encoding")];
+        if has_version(request, &etag) {
+            return (StatusCode::NOT_MODIFIED, shared).into_response();
+        }
+        let content_type = [(header::CONTENT_TYPE, self.content_type)];
+        if accepts_gzip(request) {
+            (shared, content_type, [(header::CONTENT_ENCODING, "gzip")], self.gzip).into_response()
+        } else {
+            (shared, content_type, self.bytes).into_response()
+        }
+    }
+
+    /// Checksum and size of the file, which end its gzip form. Weak: both encodings share it.
+    fn etag(&self) -> String {
+        let trailer = &self.gzip[self.gzip.len() - 8..];
+        let hex: String = trailer.iter().map(|byte| format!("{byte:02x}")).collect();
+        format!("W/\"{hex}\"")
+    }
+}
+
+/// Items of a comma-separated header.
+fn items(request: &HeaderMap, name: HeaderName) -> impl Iterator<Item = &str> {
+    let values = request.get_all(name).into_iter().filter_map(|value| value.to_str().ok());
+    values.flat_map(|value| value.split(',')).map(str::trim)
+}
+
+fn has_version(request: &HeaderMap, etag: &str) -> bool {
+    let opaque = |tag: &str| tag.trim_start_matches("W/").to_owned();
+    items(request, header::IF_NONE_MATCH).any(|item| item == "*" || opaque(item) == opaque(etag))
+}
+
+fn accepts_gzip(request: &HeaderMap) -> bool {
+    items(request, header::ACCEPT_ENCODING).any(|item| {
+        let (coding, weight) = item.split_once(';').unwrap_or((item, ""));
+        let is_refused = weight.trim().strip_prefix("q=").and_then(|q| q.parse::<f64>().ok()) == Some(0.0);
+        coding.trim().eq_ignore_ascii_case("gzip") && !is_refused
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{accepts_gzip, has_version};
+    use axum::http::{HeaderMap, HeaderValue, header};
+
+    #[test]
+    fn gzip_is_sent_only_to_clients_that_accept_it() {
+        for (value, expected) in [
+            ("gzip, deflate, br", true),
+            ("br;q=1.0, GZIP;q=0.8", true),
+            ("identity", false),
+            ("gzip;q=0", false),
+            ("gzip; q=0.0, br", false),
+            ("x-gzip", false),
+        ] {
+            let headers = HeaderMap::from_iter([(header::ACCEPT_ENCODING, HeaderValue::from_static(value))]);
+            assert_eq!(accepts_gzip(&headers), expected, "{value}");
+        }
+        assert!(!accepts_gzip(&HeaderMap::new()));
+    }
+
+    #[test]
+    fn a_version_is_recognized_in_a_list() {
+        for (value, expected) in [("\"a\", W/\"b\"", true), ("\"b\"", true), ("*", true), ("\"c\"", false)] {
+            let headers = HeaderMap::from_iter([(header::IF_NONE_MATCH, HeaderValue::from_static(value))]);
+            assert_eq!(has_version(&headers, "W/\"b\""), expected, "{value}");
+        }
+    }
+}

@@ -1,24 +1,34 @@
 //! Packs pictures and live images into binary messages.
 
+use crate::clock::ServerClock;
+use crate::jpeg::{Chroma, Layout, Pixels, Unencodable, encode, n_threads, shrink};
 use crate::news::{LiveImage, LivePixels};
 use crate::protocol::{BinaryHeader, ColorPart, DepthFormat, DepthPart, LiveHeader, PictureHeader, frame};
 use crate::render_order::RenderOrder;
-use image::ExtendedColorType;
-use image::codecs::jpeg::JpegEncoder;
 use trainer::Picture;
 
 /// JPEG quality of the last stage: no visible blocks on textures.
 const QUALITY_LAST: u8 = 92;
 /// JPEG quality of everything that is replaced soon.
 const QUALITY_BRIEF: u8 = 80;
+/// Color of pictures with fewer pixels keeps its resolution: there is little to gain, and they are shown enlarged.
+const MIN_HALVED_PX: usize = 256 * 256;
+/// Live images are sent at most this wide: the page shows them smaller still.
+const MAX_LIVE_WIDTH_PX: u32 = 640;
+/// Depth of fewer pixels than this per thread gains nothing from another thread.
+const MIN_DEPTH_PX: usize = 128 * 1024;
 
 /// Why a picture cannot be sent.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum Unsendable {
-    #[error("a {width} x {height} image needs {needed} values but has {got}")]
-    Length { width: u32, height: u32, needed: usize, got: usize },
-    #[error("the image cannot be encoded: {0}")]
-    Encode(#[from] image::ImageError),
+    #[error("a {width} x {height} depth map needs {needed} values but has {got}")]
+    DepthLength { width: u32, height: u32, needed: usize, got: usize },
+    #[error(transparent)]
+    Encode(#[from] Unencodable),
+    #[error("the JPEG file cannot be decoded: {0}")]
+    Decode(#[from] image::ImageError),
+    #[error("the JPEG file is {got:?} pixels but {expected:?} were announced")]
+    Announced { got: [u32; 2], expected: [u32; 2] },
 }
 
 /// The binary message of one drawn stage.
@@ -27,60 +37,65 @@ pub(crate) fn pack_picture(
     mut header: PictureHeader,
     picture: &Picture,
 ) -> Result<Vec<u8>, Unsendable> {
-    let (mut color, mut depth) = (Vec::new(), Vec::new());
+    let (color, depth) = std::thread::scope(|scope| {
+        // Both at once: color takes most of the time and keeps this thread.
+        let depth = order.depth.map(|format| scope.spawn(move || pack_depth(format, picture)));
+        let color = order.color.then(|| pack_color(picture, header.last));
+        (color, depth.map(|task| task.join().expect("packing depth does not panic")))
+    });
+    let color = color.transpose()?.unwrap_or_default();
     if order.color {
-        let quality = if header.last { QUALITY_LAST } else { QUALITY_BRIEF };
-        color = jpeg_from_rgba(picture.size_px, &picture.rgba_srgb, quality)?;
         header.color = Some(ColorPart { format: "jpeg", offset: 0, bytes: color.len() });
     }
-    if let Some(format) = order.depth {
-        check_length(picture.size_px, 1, picture.depth_m.len())?;
-        let packed = match format {
-            DepthFormat::F32 => f32_depth(picture),
-            DepthFormat::U16Half => half_depth(picture),
-        };
-        depth = packed.bytes;
+    let mut depth_bytes = Vec::new();
+    if let (Some(packed), Some(format)) = (depth.transpose()?, order.depth) {
+        depth_bytes = packed.bytes;
         header.depth = Some(DepthPart {
             format,
             size_px: packed.size_px,
             metres_per_count: packed.metres_per_count,
             offset: color.len(),
-            bytes: depth.len(),
+            bytes: depth_bytes.len(),
         });
     }
-    Ok(frame(&BinaryHeader::Picture(&header), &[&color, &depth]))
+    Ok(frame(&BinaryHeader::Picture(&header), &[&color, &depth_bytes]))
 }
 
-/// JPEG bytes of a live image.
-pub(crate) fn live_jpeg(image: &LiveImage) -> Result<Vec<u8>, Unsendable> {
-    match &image.pixels {
-        LivePixels::Jpeg(bytes) => Ok(bytes.to_vec()),
-        LivePixels::Rgb(pixels) => jpeg_from_rgb(image.size_px, pixels, QUALITY_BRIEF),
-        LivePixels::Rgba(pixels) => jpeg_from_rgba(image.size_px, pixels, QUALITY_BRIEF),
+fn pack_color(picture: &Picture, is_last: bool) -> Result<Vec<u8>, Unencodable> {
+    let pixels = Pixels { size_px: picture.size_px, layout: Layout::Rgba, bytes: &picture.rgba_srgb };
+    let is_small = picture.rgba_srgb.len() < 4 * MIN_HALVED_PX;
+    let quality = if is_last { QUALITY_LAST } else { QUALITY_BRIEF };
+    encode(&pixels, quality, if is_last || is_small { Chroma::Full } else { Chroma::Halved })
+}
+
+/// The binary message of a live image, shrunk to what a page shows.
+pub(crate) fn pack_live_image(image: &LiveImage, clock: ServerClock) -> Result<Vec<u8>, Unsendable> {
+    let factor = image.size_px[0].div_ceil(MAX_LIVE_WIDTH_PX).max(1);
+    let decoded;
+    let pixels = match &image.pixels {
+        LivePixels::Jpeg(file) if factor == 1 => return Ok(live_message(image, image.size_px, 1, file, clock)),
+        LivePixels::Jpeg(file) => {
+            decoded = image::load_from_memory_with_format(file, image::ImageFormat::Jpeg)?.into_rgb8();
+            let got = [decoded.width(), decoded.height()];
+            if got != image.size_px {
+                return Err(Unsendable::Announced { got, expected: image.size_px });
+            }
+            Pixels { size_px: got, layout: Layout::Rgb, bytes: decoded.as_raw() }
+        }
+        LivePixels::Rgb(bytes) => Pixels { size_px: image.size_px, layout: Layout::Rgb, bytes },
+        LivePixels::Rgba(bytes) => Pixels { size_px: image.size_px, layout: Layout::Rgba, bytes },
+    };
+    if factor == 1 {
+        let jpeg = encode(&pixels, QUALITY_BRIEF, Chroma::Halved)?;
+        return Ok(live_message(image, image.size_px, 1, &jpeg, clock));
     }
+    let (size_px, rgb) = shrink(&pixels, factor)?;
+    let jpeg = encode(&Pixels { size_px, layout: Layout::Rgb, bytes: &rgb }, QUALITY_BRIEF, Chroma::Halved)?;
+    Ok(live_message(image, size_px, factor, &jpeg, clock))
 }
 
-/// The binary message of a live image.
-pub(crate) fn pack_live_image(image: &LiveImage, jpeg: &[u8]) -> Vec<u8> {
-    frame(&BinaryHeader::LiveImage(&LiveHeader::from(image)), &[jpeg])
-}
-
-fn jpeg_from_rgba(size_px: [u32; 2], rgba: &[u8], quality: u8) -> Result<Vec<u8>, Unsendable> {
-    check_length(size_px, 4, rgba.len())?;
-    let rgb: Vec<u8> = rgba.chunks_exact(4).flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).collect();
-    jpeg_from_rgb(size_px, &rgb, quality)
-}
-
-fn jpeg_from_rgb(size_px: [u32; 2], rgb: &[u8], quality: u8) -> Result<Vec<u8>, Unsendable> {
-    check_length(size_px, 3, rgb.len())?;
-    let mut bytes = Vec::with_capacity(rgb.len() / 8);
-    JpegEncoder::new_with_quality(&mut bytes, quality).encode(rgb, size_px[0], size_px[1], ExtendedColorType::Rgb8)?;
-    Ok(bytes)
-}
-
-fn check_length([width, height]: [u32; 2], n_channels: usize, got: usize) -> Result<(), Unsendable> {
-    let needed = width as usize * height as usize * n_channels;
-    if got == needed { Ok(()) } else { Err(Unsendable::Length { width, height, needed, got }) }
+fn live_message(image: &LiveImage, size_px: [u32; 2], factor: u32, jpeg: &[u8], clock: ServerClock) -> Vec<u8> {
+    frame(&BinaryHeader::LiveImage(&LiveHeader::new(image, size_px, factor, clock)), &[jpeg])
 }
 
 /// Depth as it goes on the wire.
@@ -90,38 +105,93 @@ struct PackedDepth {
     bytes: Vec<u8>,
 }
 
+fn pack_depth(format: DepthFormat, picture: &Picture) -> Result<PackedDepth, Unsendable> {
+    let [width, height] = picture.size_px;
+    let needed = width as usize * height as usize;
+    let got = picture.depth_m.len();
+    if got != needed {
+        return Err(Unsendable::DepthLength { width, height, needed, got });
+    }
+    Ok(match format {
+        DepthFormat::F32 => f32_depth(picture),
+        DepthFormat::U16Half => half_depth(picture, n_threads().min(needed / MIN_DEPTH_PX)),
+    })
+}
+
 fn f32_depth(picture: &Picture) -> PackedDepth {
-    let bytes = picture.depth_m.iter().flat_map(|depth| depth.to_le_bytes()).collect();
+    let mut bytes = vec![0; 4 * picture.depth_m.len()];
+    for (packed, depth) in bytes.chunks_exact_mut(4).zip(&picture.depth_m) {
+        packed.copy_from_slice(&depth.to_le_bytes());
+    }
     PackedDepth { size_px: picture.size_px, metres_per_count: 1.0, bytes }
 }
 
 /// Halves the size, keeping the nearest of each 2x2 pixels so that thin things in front stay; 0 is nothing.
 ///
 /// The largest depth becomes the largest count, so the step is as fine as 16 bits allow.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "counts lie between 0 and 65535")]
-fn half_depth(picture: &Picture) -> PackedDepth {
-    let [width, height] = picture.size_px.map(|n| n as usize);
-    let is_seen = |depth: &f32| *depth > 0.0 && depth.is_finite();
-    let furthest_m = picture.depth_m.iter().copied().filter(is_seen).fold(0.0, f32::max);
-    let metres_per_count = if furthest_m > 0.0 { f64::from(furthest_m) / f64::from(u16::MAX) } else { 1.0 };
+fn half_depth(picture: &Picture, n_threads: usize) -> PackedDepth {
+    let width = picture.size_px[0] as usize;
     let size_px = picture.size_px.map(|n| n.div_ceil(2));
-    let mut bytes = Vec::with_capacity(2 * size_px[0] as usize * size_px[1] as usize);
-    for y in (0..height).step_by(2) {
-        for x in (0..width).step_by(2) {
-            let rows = y..(y + 2).min(height);
-            let block = rows.flat_map(|row| (x..(x + 2).min(width)).map(move |column| row * width + column));
-            let nearest_m = block.map(|ix| picture.depth_m[ix]).filter(is_seen).fold(f32::INFINITY, f32::min);
-            let count =
-                if nearest_m.is_finite() { (f64::from(nearest_m) / metres_per_count).round().max(1.0) } else { 0.0 };
-            bytes.extend_from_slice(&(count as u16).to_le_bytes());
+    let out_width = size_px[0] as usize;
+    let pairs_per_thread = (size_px[1] as usize).div_ceil(n_threads.max(1)).max(1);
+    let (bands, mut bytes) = (picture.depth_m.chunks((2 * width * pairs_per_thread).max(1)), Vec::new());
+    let furthest_m = std::thread::scope(|scope| {
+        let tasks: Vec<_> = bands.clone().map(|band| scope.spawn(move || furthest(band))).collect();
+        tasks.into_iter().map(|task| task.join().expect("a maximum does not panic")).fold(0.0, f32::max)
+    });
+    let metres_per_count = if furthest_m > 0.0 { f64::from(furthest_m) / f64::from(u16::MAX) } else { 1.0 };
+    bytes.resize(2 * out_width * size_px[1] as usize, 0);
+    std::thread::scope(|scope| {
+        for (band, packed) in bands.zip(bytes.chunks_mut((2 * out_width * pairs_per_thread).max(1))) {
+            scope.spawn(move || {
+                let mut nearest_m = vec![0.0; out_width];
+                for (rows, packed) in band.chunks(2 * width).zip(packed.chunks_exact_mut(2 * out_width)) {
+                    let (upper, lower) = rows.split_at(width);
+                    // The last row of an odd height has none below it.
+                    nearest_of_squares(upper, if lower.is_empty() { upper } else { lower }, &mut nearest_m);
+                    write_counts(&nearest_m, 1.0 / metres_per_count, packed);
+                }
+            });
         }
-    }
+    });
     PackedDepth { size_px, metres_per_count, bytes }
+}
+
+/// Depth of a pixel where something is seen, else infinity.
+fn seen_or_infinity(depth_m: f32) -> f32 {
+    // False for a NaN.
+    if depth_m > 0.0 { depth_m } else { f32::INFINITY }
+}
+
+fn furthest(depth_m: &[f32]) -> f32 {
+    depth_m.iter().fold(0.0, |furthest, &depth| if depth.is_finite() { furthest.max(depth) } else { furthest })
+}
+
+fn nearest_of_squares(upper: &[f32], lower: &[f32], nearest_m: &mut [f32]) {
+    let squares = upper.chunks(2).zip(lower.chunks(2));
+    for (nearest, (upper, lower)) in nearest_m.iter_mut().zip(squares) {
+        let (right_above, right_below) = (upper[upper.len() - 1], lower[lower.len() - 1]);
+        let left = seen_or_infinity(upper[0]).min(seen_or_infinity(lower[0]));
+        *nearest = left.min(seen_or_infinity(right_above)).min(seen_or_infinity(right_below));
+    }
+}
+
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "counts lie between 0 and 65535")]
+fn write_counts(depth_m: &[f32], counts_per_metre: f64, packed: &mut [u8]) {
+    for (packed, depth) in packed.chunks_exact_mut(2).zip(depth_m) {
+        let count = (f64::from(*depth) * counts_per_metre + 0.5) as u16;
+        let count = if depth.is_finite() { count.max(1) } else { 0 };
+        packed.copy_from_slice(&count.to_le_bytes());
+    }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{half_depth, jpeg_from_rgba};
+    use super::{PackedDepth, half_depth, pack_live_image};
+    use crate::clock::ServerClock;
+    use crate::news::{LiveImage, LivePixels};
+    use kinematics::Stamp;
+    use std::time::Instant;
     use trainer::Picture;
 
     #[test]
@@ -144,7 +214,12 @@ mod tests {
             10.0,
         ];
         let picture = Picture { size_px: [5, 3], rgba_srgb: vec![0; 60], depth_m };
-        let packed = half_depth(&picture);
+        for n_threads in [1, 2, 5] {
+            check_halved(&half_depth(&picture, n_threads));
+        }
+    }
+
+    fn check_halved(packed: &PackedDepth) {
         assert_eq!(packed.size_px, [3, 2]);
         let counts = packed.bytes.chunks_exact(2).map(|count| u16::from_le_bytes([count[0], count[1]]));
         let metres: Vec<f64> = counts.map(|count| f64::from(count) * packed.metres_per_count).collect();
@@ -155,14 +230,91 @@ mod tests {
 
     #[test]
     fn a_picture_without_anything_has_zero_depth() {
-        let packed = half_depth(&Picture { size_px: [2, 2], rgba_srgb: vec![0; 16], depth_m: vec![0.0; 4] });
+        let packed = half_depth(&Picture { size_px: [2, 2], rgba_srgb: vec![0; 16], depth_m: vec![0.0; 4] }, 1);
         assert_eq!(packed.bytes, [0, 0]);
     }
 
     #[test]
-    fn a_wrong_length_is_an_error_not_a_panic() {
-        let error = jpeg_from_rgba([4, 4], &[0; 63], 90).expect_err("63 bytes");
-        assert_eq!(error.to_string(), "a 4 x 4 image needs 64 values but has 63");
-        assert!(jpeg_from_rgba([4, 4], &[0; 64], 90).is_ok());
+    fn large_live_images_are_shrunk_and_their_lens_with_them() {
+        let size_px = [1280, 720];
+        let rgb: Vec<u8> = (0..size_px[0] * size_px[1]).flat_map(|_| [200, 100, 50]).collect();
+        let jpeg = {
+            let mut file = std::io::Cursor::new(Vec::new());
+            let image = image::RgbImage::from_raw(size_px[0], size_px[1], rgb.clone()).expect("the length fits");
+            image.write_to(&mut file, image::ImageFormat::Jpeg).expect("encoded");
+            file.into_inner()
+        };
+        let clock = ServerClock::start();
+        for pixels in [LivePixels::Rgb(rgb.into()), LivePixels::Jpeg(jpeg.into())] {
+            let image = LiveImage {
+                camera: "wrist".into(),
+                stamp: Stamp(1),
+                captured_at: Instant::now(),
+                size_px,
+                pixels,
+                world_from_camera: None,
+                focal_px: [900.0, 902.0],
+                principal_px: [640.0, 360.0],
+            };
+            let message = pack_live_image(&image, clock).expect("packed");
+            let n_header = u32::from_le_bytes([message[0], message[1], message[2], message[3]]) as usize;
+            let header: serde_json::Value = serde_json::from_slice(&message[4..4 + n_header]).expect("JSON");
+            assert_eq!(header["size_px"], serde_json::json!([640, 360]));
+            assert_eq!(header["focal_px"], serde_json::json!([450.0, 451.0]));
+            assert_eq!(header["principal_px"], serde_json::json!([320.0, 180.0]));
+            let sent = image::load_from_memory_with_format(&message[4 + n_header..], image::ImageFormat::Jpeg);
+            let sent = sent.expect("a JPEG file").to_rgb8();
+            assert_eq!((sent.width(), sent.height()), (640, 360));
+            let [red, green, blue] = sent.get_pixel(320, 180).0;
+            assert!(red.abs_diff(200) < 6 && green.abs_diff(100) < 6 && blue.abs_diff(50) < 6);
+        }
+    }
+
+    /// Prints how long packing takes: `cargo test --release -p viz -- --ignored --nocapture packing`.
+    #[test]
+    #[ignore = "measures"]
+    #[expect(clippy::print_stdout, clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a measurement")]
+    fn packing_takes() {
+        for size_px in [[1024, 1024], [1280, 720]] {
+            let n_px = size_px[0] * size_px[1];
+            let wave = |ix: u32, period: f64| (127.0 + 100.0 * (f64::from(ix) / period).sin()) as u8;
+            let noise = |ix: u32| (ix.wrapping_mul(2_654_435_761) >> 28) as u8;
+            let rgba_srgb: Vec<u8> = (0..n_px)
+                .flat_map(|ix| {
+                    [wave(ix % size_px[0], 31.0) + noise(ix), wave(ix / size_px[0], 17.0), wave(ix, 977.0), 255]
+                })
+                .collect();
+            let depth_m = (0..n_px).map(|ix| 1.0 + (ix % 977) as f32 * 1e-3).collect();
+            let picture = Picture { size_px, rgba_srgb, depth_m };
+            let best = |work: &dyn Fn() -> usize| {
+                (0..15)
+                    .map(|_| {
+                        let begun = Instant::now();
+                        (work(), begun.elapsed().as_secs_f64() * 1e3)
+                    })
+                    .min_by(|a, b| a.1.total_cmp(&b.1))
+                    .expect("15 runs")
+            };
+            let pixels = crate::jpeg::Pixels { size_px, layout: crate::jpeg::Layout::Rgba, bytes: &picture.rgba_srgb };
+            use crate::jpeg::Chroma;
+            for (name, quality, chroma) in
+                [("4:4:4 q92", 92, Chroma::Full), ("4:2:0 q92", 92, Chroma::Halved), ("4:2:0 q80", 80, Chroma::Halved)]
+            {
+                let (bytes, millis) = best(&|| crate::jpeg::encode(&pixels, quality, chroma).expect("encoded").len());
+                println!("{size_px:?} color {name}: {millis:.2} ms, {bytes} bytes");
+            }
+            let (bytes, millis) = best(&|| half_depth(&picture, crate::jpeg::n_threads()).bytes.len());
+            println!("{size_px:?} depth u16_half: {millis:.2} ms, {bytes} bytes");
+            let (bytes, millis) = best(&|| {
+                let rgb: Vec<u8> =
+                    picture.rgba_srgb.chunks_exact(4).flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).collect();
+                let mut file = Vec::new();
+                image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, 92)
+                    .encode(&rgb, size_px[0], size_px[1], image::ExtendedColorType::Rgb8)
+                    .expect("encoded");
+                file.len()
+            });
+            println!("{size_px:?} color by the image crate, 4:4:4 q92: {millis:.2} ms, {bytes} bytes");
+        }
     }
 }

@@ -1,11 +1,12 @@
 //! The messages of `docs/protocol.md` as they are written on the wire.
 
+use crate::clock::ServerClock;
 use crate::news::{KeyframePose, LiveImage, SceneHint, Status};
 use crate::pose::row_major;
 use serde::{Deserialize, Serialize};
 
 /// Version of the messages; a client that says another one is sent away.
-pub const PROTOCOL_VERSION: u32 = 1;
+pub const PROTOCOL_VERSION: u32 = 2;
 
 /// Longest text message a client may send, bytes.
 pub(crate) const MAX_MESSAGE_BYTES: usize = 64 * 1024;
@@ -18,6 +19,8 @@ pub(crate) enum ClientMessage {
     Hello(ClientHello),
     /// Draw this; replaces what this client asked before.
     Render(Box<RenderMessage>),
+    /// Asks for the server's time.
+    Ping(ClientPing),
     /// The client leaves.
     Goodbye(ClientGoodbye),
 }
@@ -28,6 +31,14 @@ pub(crate) enum ClientMessage {
 pub(crate) struct ClientHello {
     /// See [`PROTOCOL_VERSION`].
     pub(crate) protocol: u32,
+}
+
+/// Fields of `ping`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct ClientPing {
+    /// Repeated in the `pong`.
+    pub(crate) t: f64,
 }
 
 /// A client's `goodbye` has no fields.
@@ -123,7 +134,14 @@ pub(crate) enum DepthFormat {
 #[serde(tag = "type", rename_all = "snake_case")]
 pub(crate) enum ServerMessage<'a> {
     /// First message of a connection.
-    Hello { protocol: u32, server: &'a str, client: u64, max_size_px: [u32; 2], default_stages: &'a [f64] },
+    Hello {
+        protocol: u32,
+        server: &'a str,
+        client: u64,
+        max_size_px: [u32; 2],
+        default_stages: &'a [f64],
+        clock_millis: f64,
+    },
     /// Where the run stands.
     Status(&'a Status),
     /// Where the scene is.
@@ -132,6 +150,10 @@ pub(crate) enum ServerMessage<'a> {
     Keyframes { keyframes: Vec<KeyframeMessage<'a>> },
     /// What was wrong with a message or a picture.
     Error { id: Option<u64>, message: &'a str },
+    /// Sent at a fixed rate, so that silence means a broken connection.
+    Heartbeat { clock_millis: f64 },
+    /// Answers a client's `ping`.
+    Pong { t: f64, clock_millis: f64 },
     /// The connection ends.
     Goodbye { reason: &'a str },
 }
@@ -220,6 +242,7 @@ pub(crate) struct DepthPart {
 pub(crate) struct LiveHeader<'a> {
     camera: &'a str,
     stamp_nanos: i64,
+    captured_millis: f64,
     size_px: [u32; 2],
     format: &'static str,
     world_from_camera: Option<[f64; 16]>,
@@ -227,16 +250,19 @@ pub(crate) struct LiveHeader<'a> {
     principal_px: [f64; 2],
 }
 
-impl<'a> From<&'a LiveImage> for LiveHeader<'a> {
-    fn from(image: &'a LiveImage) -> Self {
+impl<'a> LiveHeader<'a> {
+    /// The header of an image that is sent at `size_px` after its sides were divided by `factor`.
+    pub(crate) fn new(image: &'a LiveImage, size_px: [u32; 2], factor: u32, clock: ServerClock) -> Self {
+        let shrunk = |value: f64| value / f64::from(factor);
         Self {
             camera: &image.camera,
             stamp_nanos: image.stamp.0,
-            size_px: image.size_px,
+            captured_millis: clock.millis(image.captured_at),
+            size_px,
             format: "jpeg",
             world_from_camera: image.world_from_camera.as_ref().map(row_major),
-            focal_px: image.focal_px,
-            principal_px: image.principal_px,
+            focal_px: image.focal_px.map(shrunk),
+            principal_px: image.principal_px.map(shrunk),
         }
     }
 }

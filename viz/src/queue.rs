@@ -10,6 +10,9 @@ use trainer::Picture;
 /// Pictures of one client that may be drawn or on their way; a slow client costs no more rendering than this.
 const MAX_UNSENT: usize = 2;
 
+/// Where the full picture is expected to take less time than this, coarser stages before it only delay it.
+const FAST_MILLIS: f64 = 20.0;
+
 /// All connected clients and what they wait for.
 #[derive(Debug, Default)]
 pub(crate) struct Queue {
@@ -26,6 +29,15 @@ struct Waiting {
     n_unsent: usize,
     outbox: VecDeque<Outgoing>,
     wake: Arc<Notify>,
+    last_full: Option<FullPicture>,
+}
+
+/// How long the last stage of a client's last request took.
+#[derive(Debug)]
+struct FullPicture {
+    method: Option<String>,
+    n_px: f64,
+    millis: f64,
 }
 
 /// One stage that the training side shall draw.
@@ -69,8 +81,13 @@ impl Queue {
     }
 
     /// Takes an order in; the stages of the client's older order that nobody has begun are given up.
-    pub(crate) fn order(&mut self, client: u64, order: RenderOrder) {
+    ///
+    /// Only the last stage is kept if it is expected to be fast.
+    pub(crate) fn order(&mut self, client: u64, mut order: RenderOrder) {
         if let Some(waiting) = self.clients.get_mut(&client) {
+            if waiting.last_full.as_ref().is_some_and(|last| last.expected_millis(&order) < FAST_MILLIS) {
+                order.stages.drain(..order.stages.len() - 1);
+            }
             waiting.order = Some(Arc::new(order));
             waiting.next_stage = 0;
         }
@@ -87,6 +104,14 @@ impl Queue {
         let (&client, _) = after.or_else(|| self.clients.iter().find(|(_, waiting)| waiting.is_ready()))?;
         self.last_served = client;
         self.clients.get_mut(&client)?.take(client)
+    }
+
+    /// Remembers how long the last stage of an order took to draw.
+    pub(crate) fn drawn(&mut self, ticket: &Ticket, millis: f64) {
+        if let Some(waiting) = self.clients.get_mut(&ticket.client) {
+            let (method, n_px) = (ticket.order.method.clone(), n_px_of_last_stage(&ticket.order));
+            waiting.last_full = Some(FullPicture { method, n_px, millis });
+        }
     }
 
     /// Puts a result into a client's outbox and wakes it.
@@ -125,6 +150,21 @@ impl Waiting {
         }
         Some(Ticket { client, order, stage })
     }
+}
+
+impl FullPicture {
+    /// Time that the last stage of an order is expected to take: in proportion to its pixels, if it has more.
+    fn expected_millis(&self, order: &RenderOrder) -> f64 {
+        if self.method != order.method {
+            return f64::INFINITY;
+        }
+        self.millis * (n_px_of_last_stage(order) / self.n_px).max(1.0)
+    }
+}
+
+fn n_px_of_last_stage(order: &RenderOrder) -> f64 {
+    let size_px = order.stage_request(order.stages.len() - 1).size_px;
+    f64::from(size_px[0]) * f64::from(size_px[1])
 }
 
 #[cfg(test)]
@@ -192,6 +232,34 @@ mod tests {
         assert_eq!(served, [slow, fast, slow, fast, fast]);
         queue.settle(slow);
         assert!(queue.has_work());
+    }
+
+    #[test]
+    fn after_a_fast_full_picture_only_the_last_stage_is_drawn() {
+        let mut queue = Queue::default();
+        let (a, _) = queue.join();
+        let draw = |queue: &mut Queue, id: u64, millis: f64, change: fn(&mut RenderOrder)| {
+            let mut asked = order(id);
+            change(&mut asked);
+            queue.order(a, asked);
+            let mut scales = Vec::new();
+            while let Some(ticket) = queue.take() {
+                scales.push(ticket.order.stages[ticket.stage]);
+                if ticket.stage + 1 == ticket.order.stages.len() {
+                    queue.drawn(&ticket, millis);
+                }
+                queue.settle(a);
+            }
+            scales
+        };
+        assert_eq!(draw(&mut queue, 1, 19.0, |_| ()), [0.1, 0.5, 1.0], "nothing is known yet");
+        assert_eq!(draw(&mut queue, 2, 21.0, |_| ()), [1.0], "the last one was fast");
+        assert_eq!(draw(&mut queue, 3, 3.0, |_| ()), [0.1, 0.5, 1.0], "the last one was slow");
+        assert_eq!(draw(&mut queue, 4, 3.0, |order| order.stages = vec![0.5]), [0.5]);
+        assert_eq!(draw(&mut queue, 5, 6.0, |_| ()), [1.0], "four times the pixels in 12 ms");
+        assert_eq!(draw(&mut queue, 6, 6.0, |order| order.request.size_px = [200, 200]), [0.1, 0.5, 1.0], "24 ms");
+        assert_eq!(draw(&mut queue, 7, 1.0, |order| order.method = Some("nerf".to_owned())), [0.1, 0.5, 1.0]);
+        assert_eq!(draw(&mut queue, 8, 1.0, |order| order.method = Some("nerf".to_owned())), [1.0]);
     }
 
     #[test]

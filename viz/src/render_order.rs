@@ -81,6 +81,7 @@ impl RenderOrder {
                 crop: message.crop.as_ref().map(checked_crop).transpose()?,
                 background_srgb: checked_background(message.background_srgb.unwrap_or([0.0; 3]))?,
                 light_of: None,
+                depth: outputs.contains(&Output::Depth),
             },
             stages: checked_stages(message.stages.as_deref().unwrap_or(&DEFAULT_STAGES))?,
             color: outputs.contains(&Output::Color),

@@ -1,24 +1,48 @@
 //! One port for the page, the status and the WebSocket, on its own thread.
 
-use crate::page::{FILES, PageFile};
+use crate::admission::{Admission, Connection, GuardedStream, Limits};
+use crate::broadcast::broadcast;
+use crate::clock::ServerClock;
+use crate::page::FILES;
 use crate::protocol::MAX_MESSAGE_BYTES;
-use crate::{Error, Hub, Status, session};
-use axum::Router;
-use axum::extract::{Request, State, WebSocketUpgrade};
-use axum::http::{HeaderMap, HeaderName, StatusCode, header};
+use crate::session::{self, Site};
+use crate::{Error, Hub, Status};
+use axum::extract::{Extension, Request, State, WebSocketUpgrade};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::middleware::{Next, from_fn};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
-use axum::serve::ListenerExt;
+use axum::{Router, body::Body};
+use hyper::server::conn::http1;
+use hyper::service::Service;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use std::io::ErrorKind;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
+use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 use tokio::sync::watch;
 
 /// How long a stopping server waits for its clients to be told.
 const GOODBYE_TIMEOUT: Duration = Duration::from_millis(500);
-/// More clients than this are refused.
-const MAX_CLIENTS: usize = 32;
+/// A request whose headers are not complete after this long ends its connection, and so does the wait for a next request.
+const HEADER_TIMEOUT: Duration = Duration::from_secs(3);
+/// Longest request with all its headers, bytes.
+const MAX_REQUEST_BYTES: usize = 32 * 1024;
+/// How often connections are checked for having been idle, stuck or silent for too long.
+const SWEEP_PERIOD: Duration = Duration::from_millis(250);
+/// After a failed accept, the next one waits this long.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
+/// Bytes that the kernel may hold for a client that reads slowly; Linux doubles it. More would only age there.
+#[cfg(unix)]
+const SEND_BUFFER_BYTES: usize = 64 * 1024;
+/// Connections that may wait to be accepted.
+#[cfg(unix)]
+const BACKLOG: i32 = 1024;
+/// What the page may load and who may embed it.
+const CONTENT_SECURITY_POLICY: &str = "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none'; \
+     form-action 'none'; frame-ancestors 'none'";
 
 /// Where to listen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -99,17 +123,21 @@ fn listen(address: SocketAddr) -> Result<(TcpListener, SocketAddr), Error> {
 }
 
 async fn serve(listener: TcpListener, hub: Hub, mut stopped: watch::Receiver<bool>) -> std::io::Result<()> {
-    let listener = tokio::net::TcpListener::from_std(listener)?.tap_io(|stream| {
-        // Small messages must not wait for large ones to be acknowledged; without it, only the delay grows.
-        if let Err(error) = stream.set_nodelay(true) {
-            log::debug!("cannot switch off Nagle's algorithm: {error}");
-        }
-    });
-    let app = router(hub.clone(), stopped.clone());
+    #[cfg(unix)]
+    tune(&listener);
+    let listener = tokio::net::TcpListener::from_std(listener)?;
+    let clock = ServerClock::start();
+    let (bulletin_sender, bulletin) = watch::channel(crate::broadcast::Bulletin::default());
+    tokio::spawn(broadcast(hub.clone(), clock, bulletin_sender));
+    let admission = Admission::new(Limits::of_process());
+    let site = Site { hub: hub.clone(), clock, bulletin, stopped: stopped.clone() };
+    let app = TowerToHyperService::new(router(Visited { site, admission: Arc::clone(&admission) }));
     tokio::select! {
-        ended = axum::serve(listener, app).into_future() => return ended,
+        () = accept(&listener, &admission, &app) => {}
+        () = sweep(&admission) => {}
         _ = stopped.changed() => {}
     }
+    drop(listener);
     let all_left = async {
         while hub.n_clients() > 0 {
             tokio::time::sleep(Duration::from_millis(5)).await;
@@ -121,44 +149,127 @@ async fn serve(listener: TcpListener, hub: Hub, mut stopped: watch::Receiver<boo
     Ok(())
 }
 
+/// Sets what accepted sockets inherit; a failure costs only some delay.
+#[cfg(unix)]
+fn tune(listener: &TcpListener) {
+    let tuned = rustix::net::sockopt::set_socket_send_buffer_size(listener, SEND_BUFFER_BYTES)
+        .and_then(|()| rustix::net::listen(listener, BACKLOG));
+    if let Err(error) = tuned {
+        log::debug!("cannot set the socket's buffer and backlog: {error}");
+    }
+}
+
+/// Accepts connections and serves each in a task of its own; never returns.
+async fn accept(listener: &tokio::net::TcpListener, admission: &Arc<Admission>, app: &TowerToHyperService<Router>) {
+    loop {
+        match listener.accept().await {
+            Ok((stream, _)) => {
+                // Small messages must not wait for large ones to be acknowledged; without it, only the delay grows.
+                if let Err(error) = stream.set_nodelay(true) {
+                    log::debug!("cannot switch off Nagle's algorithm: {error}");
+                }
+                let (stream, has_evicted) = admission.admit(stream);
+                tokio::spawn(serve_connection(stream, app.clone()));
+                if has_evicted {
+                    // The other connection's task closes its descriptor before the next one is accepted.
+                    tokio::task::yield_now().await;
+                }
+            }
+            // The peer has left again.
+            Err(error) if matches!(error.kind(), ErrorKind::ConnectionAborted | ErrorKind::ConnectionReset) => {}
+            Err(error) => {
+                // Most likely all file descriptors are in use: one is given back, and the pause avoids a busy loop.
+                log::warn!("cannot accept a connection: {error}");
+                admission.evict();
+                tokio::time::sleep(ACCEPT_PAUSE).await;
+            }
+        }
+    }
+}
+
+/// Enforces the time limits of connections; never returns.
+async fn sweep(admission: &Admission) {
+    loop {
+        tokio::time::sleep(SWEEP_PERIOD).await;
+        admission.sweep();
+    }
+}
+
+async fn serve_connection(stream: GuardedStream, app: TowerToHyperService<Router>) {
+    let connection = Arc::clone(stream.connection());
+    let service = hyper::service::service_fn(|request: hyper::Request<hyper::body::Incoming>| {
+        connection.requested();
+        let mut request = request.map(Body::new);
+        request.extensions_mut().insert(Arc::clone(&connection));
+        app.call(request)
+    });
+    let served = http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(HEADER_TIMEOUT)
+        .max_buf_size(MAX_REQUEST_BYTES)
+        .serve_connection(TokioIo::new(stream), service)
+        .with_upgrades()
+        .await;
+    if let Err(error) = served {
+        log::debug!("a connection broke: {error}");
+    }
+}
+
 /// What the handlers share.
 #[derive(Clone)]
-struct Site {
-    hub: Hub,
-    stopped: watch::Receiver<bool>,
+struct Visited {
+    site: Site,
+    admission: Arc<Admission>,
 }
 
-fn router(hub: Hub, stopped: watch::Receiver<bool>) -> Router {
+fn router(visited: Visited) -> Router {
     let mut router = Router::new().route("/status", get(status)).route("/ws", get(connect));
     for file in FILES {
-        router = router.route(file.path, get(|| async { page_file(file) }));
+        router = router.route(file.path, get(move |headers: HeaderMap| async move { file.response(&headers) }));
     }
-    router.layer(from_fn(refuse_strangers)).with_state(Site { hub, stopped })
+    router.layer(from_fn(refuse_strangers)).layer(from_fn(secure)).with_state(visited)
 }
 
-fn page_file(file: &'static PageFile) -> Response {
-    let headers: [(HeaderName, &str); 2] =
-        [(header::CONTENT_TYPE, file.content_type), (header::CACHE_CONTROL, "no-cache")];
-    (headers, file.bytes).into_response()
-}
-
-async fn status(State(site): State<Site>) -> Response {
-    let latest = site.hub.status().borrow().clone();
+async fn status(State(visited): State<Visited>) -> Response {
+    let latest = visited.site.hub.status().borrow().clone();
     let json = match latest {
         Some(status) => serde_json::to_string(&*status),
         None => serde_json::to_string(&Status::default()),
     };
     match json {
-        Ok(json) => ([(header::CONTENT_TYPE, "application/json")], json).into_response(),
+        Ok(json) => {
+            let headers = [(header::CONTENT_TYPE, "application/json"), (header::CACHE_CONTROL, "no-store")];
+            (headers, json).into_response()
+        }
         Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()).into_response(),
     }
 }
 
-async fn connect(upgrade: WebSocketUpgrade, State(site): State<Site>) -> Response {
-    if site.hub.n_clients() >= MAX_CLIENTS {
-        return (StatusCode::SERVICE_UNAVAILABLE, "all places for clients are taken").into_response();
+async fn connect(
+    upgrade: WebSocketUpgrade,
+    Extension(connection): Extension<Arc<Connection>>,
+    State(visited): State<Visited>,
+) -> Response {
+    if !visited.admission.seat(&connection) {
+        return (StatusCode::SERVICE_UNAVAILABLE, "all seats for clients are in use, try again later").into_response();
     }
-    upgrade.max_message_size(MAX_MESSAGE_BYTES).on_upgrade(move |socket| session::serve(socket, site.hub, site.stopped))
+    upgrade
+        .max_message_size(MAX_MESSAGE_BYTES)
+        .on_upgrade(move |socket| session::serve(socket, connection, visited.site))
+}
+
+/// Adds headers that keep other web sites from embedding or reading what is served.
+async fn secure(request: Request, next: Next) -> Response {
+    let mut response = next.run(request).await;
+    let headers = response.headers_mut();
+    let policies: [(HeaderName, &'static str); 4] = [
+        (header::CONTENT_SECURITY_POLICY, CONTENT_SECURITY_POLICY),
+        (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
+        (header::REFERRER_POLICY, "no-referrer"),
+        (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
+    ];
+    headers.extend(policies.map(|(name, value)| (name, HeaderValue::from_static(value))));
+    response
 }
 
 /// Only pages of this server may use it: other web sites open in the same browser reach loopback too.

@@ -1,42 +1,58 @@
-//! One connected client, from hello to goodbye.
+//! One connected client, from hello to goodbye: a reader and a writer that never wait for each other.
 
 use crate::Hub;
-use crate::hub::LiveImages;
-use crate::news::{KeyframePose, LiveSlot, SceneHint, Status};
-use crate::picture::{live_jpeg, pack_live_image, pack_picture};
-use crate::protocol::{ClientMessage, KeyframeMessage, PROTOCOL_VERSION, ServerMessage};
+use crate::admission::Connection;
+use crate::broadcast::{Bulletin, Received};
+use crate::clock::ServerClock;
+use crate::picture::{Unsendable, pack_picture};
+use crate::protocol::{ClientMessage, PROTOCOL_VERSION, ServerMessage};
 use crate::queue::Outgoing;
 use crate::render_order::{DEFAULT_STAGES, MAX_SIZE_PX, Malformed, RenderOrder};
 use axum::extract::ws::{Message, WebSocket};
+use futures_util::stream::{SplitSink, SplitStream};
+use futures_util::{SinkExt, StreamExt};
 use serde::Deserialize;
-use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::sync::Arc;
-use std::time::Duration;
-use tokio::sync::watch;
+use std::time::{Duration, Instant};
+use tokio::sync::{mpsc, watch};
+use tokio::task::{JoinError, JoinHandle};
+use tokio::time::MissedTickBehavior;
 
-/// Status, live images and keyframe poses go out at most this often.
-const NEWS_PERIOD: Duration = Duration::from_millis(200);
+/// A heartbeat goes out this often, so that a page notices silence soon.
+const HEARTBEAT_PERIOD: Duration = Duration::from_millis(250);
+/// A WebSocket ping goes out this often, if the last one was answered.
+const PING_PERIOD: Duration = Duration::from_secs(1);
+/// Answers that may wait for a client to read; one that asks for more without reading is disconnected.
+const MAX_REPLIES: usize = 64;
+/// Live images and keyframe lists wait at most this long for pictures, which go first.
+const MAX_NEWS_DELAY: Duration = Duration::from_millis(500);
+
+/// What all sessions share.
+#[derive(Clone)]
+pub(crate) struct Site {
+    /// Where requests go and pictures come from.
+    pub(crate) hub: Hub,
+    /// The server's clock.
+    pub(crate) clock: ServerClock,
+    /// Encoded news.
+    pub(crate) bulletin: watch::Receiver<Bulletin>,
+    /// Becomes true when the server stops.
+    pub(crate) stopped: watch::Receiver<bool>,
+}
 
 /// Talks with one client until either side leaves.
-pub(crate) async fn serve(socket: WebSocket, hub: Hub, mut stopped: watch::Receiver<bool>) {
-    let (client, wake) = hub.join();
-    let membership = Membership { hub: &hub, client };
-    let mut session = Session { socket, hub: &hub, client, news: News::subscribe(&hub) };
+pub(crate) async fn serve(socket: WebSocket, connection: Arc<Connection>, site: Site) {
+    let (client, wake) = site.hub.join();
+    let membership = Membership { hub: &site.hub, client };
     log::info!("client {client} connected");
-    let mut news_due = tokio::time::interval(NEWS_PERIOD);
-    news_due.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-    let mut going = session.greet().await;
-    while going.is_continue() {
-        going = tokio::select! {
-            received = session.socket.recv() => match received {
-                Some(Ok(message)) => session.answer(message).await,
-                Some(Err(_)) | None => ControlFlow::Break(()),
-            },
-            () = wake.notified() => session.send_pictures().await,
-            _ = news_due.tick() => session.send_news().await,
-            _ = stopped.changed() => session.part("the server has stopped").await,
-        };
+    let (sink, stream) = socket.split();
+    let (replies, waiting_replies) = mpsc::channel(MAX_REPLIES);
+    let reader = Reader { stream, hub: &site.hub, client, connection: &connection, replies };
+    let writer = Writer { sink, site: &site, client, connection: &connection };
+    tokio::select! {
+        () = reader.run() => {}
+        _ = writer.run(&wake, waiting_replies) => {}
     }
     drop(membership);
     log::info!("client {client} left");
@@ -54,17 +70,141 @@ impl Drop for Membership<'_> {
     }
 }
 
+/// What the reader asks the writer to send.
+enum Reply {
+    Error { id: Option<u64>, message: String },
+    Pong { t: f64 },
+    Goodbye { reason: String },
+}
+
+struct Reader<'a> {
+    stream: SplitStream<WebSocket>,
+    hub: &'a Hub,
+    client: u64,
+    connection: &'a Connection,
+    replies: mpsc::Sender<Reply>,
+}
+
+impl Reader<'_> {
+    /// Reads until the client leaves or breaks the rules.
+    async fn run(mut self) {
+        while let Some(Ok(message)) = self.stream.next().await {
+            let reply = match message {
+                Message::Pong(_) => {
+                    self.connection.answered_ping();
+                    continue;
+                }
+                Message::Ping(_) => continue,
+                Message::Close(_) => return,
+                Message::Text(text) => self.answer(&text),
+                Message::Binary(_) => Some(Reply::Error {
+                    id: None,
+                    message: "binary messages are not understood, send JSON as text".to_owned(),
+                }),
+            };
+            self.connection.spoke();
+            let Some(reply) = reply else { continue };
+            let is_last = matches!(reply, Reply::Goodbye { .. });
+            if self.replies.try_send(reply).is_err() {
+                log::info!("client {} is disconnected: it does not read {MAX_REPLIES} answers", self.client);
+                return;
+            }
+            if is_last {
+                // The writer ends the session.
+                std::future::pending::<()>().await;
+            }
+        }
+    }
+
+    fn answer(&self, text: &str) -> Option<Reply> {
+        match understand(text) {
+            Ok(Understood::Order(order)) => {
+                self.hub.order(self.client, *order);
+                None
+            }
+            Ok(Understood::SameVersion) => None,
+            Ok(Understood::OtherVersion(theirs)) => Some(Reply::Goodbye {
+                reason: format!("this server speaks protocol {PROTOCOL_VERSION}, the client {theirs}"),
+            }),
+            Ok(Understood::Ping { t }) => Some(Reply::Pong { t }),
+            Ok(Understood::Goodbye) => Some(Reply::Goodbye { reason: "the client leaves".to_owned() }),
+            Err(error) => Some(Reply::Error { id: id_of(text), message: error.to_string() }),
+        }
+    }
+}
+
 /// Whether the session goes on.
 type Going = ControlFlow<()>;
 
-struct Session<'a> {
-    socket: WebSocket,
-    hub: &'a Hub,
+struct Writer<'a> {
+    sink: SplitSink<WebSocket, Message>,
+    site: &'a Site,
     client: u64,
-    news: News,
+    connection: &'a Connection,
 }
 
-impl Session<'_> {
+/// A picture that is being encoded.
+struct Packing {
+    id: u64,
+    task: JoinHandle<Result<Vec<u8>, Unsendable>>,
+}
+
+impl Writer<'_> {
+    /// Sends until the connection breaks or a goodbye is sent; pictures go before news.
+    async fn run(mut self, wake: &tokio::sync::Notify, mut replies: mpsc::Receiver<Reply>) -> Going {
+        let mut stopped = self.site.stopped.clone();
+        let mut bulletin = self.site.bulletin.clone();
+        let mut received = Received::default();
+        let mut long_news_sent = Instant::now();
+        let mut packing: Option<Packing> = None;
+        let mut heartbeat = tokio::time::interval(HEARTBEAT_PERIOD);
+        let mut ping = tokio::time::interval(PING_PERIOD);
+        heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        ping.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        self.greet().await?;
+        loop {
+            if packing.is_none()
+                && let Some(outgoing) = self.site.hub.collect(self.client)
+            {
+                match outgoing {
+                    Outgoing::Picture(drawn) => packing = Some(pack(drawn)),
+                    Outgoing::Failed { id, reason } => {
+                        let sent = self.complain(Some(id), &reason).await;
+                        self.site.hub.settle(self.client);
+                        sent?;
+                        continue;
+                    }
+                }
+            }
+            let lets_long_news = packing.is_none() || long_news_sent.elapsed() > MAX_NEWS_DELAY;
+            tokio::select! {
+                biased;
+                _ = stopped.changed() => return self.part_when_stopped().await,
+                Some(reply) = replies.recv() => self.reply(reply).await?,
+                packed = finished(&mut packing) => {
+                    let id = packing.take().map(|packing| packing.id);
+                    let sent = self.send_picture(id, packed).await;
+                    self.site.hub.settle(self.client);
+                    sent?;
+                }
+                () = wake.notified(), if packing.is_none() => {}
+                _ = heartbeat.tick() => {
+                    let clock_millis = self.site.clock.now_millis();
+                    self.say(&ServerMessage::Heartbeat { clock_millis }).await?;
+                }
+                _ = ping.tick() => if self.connection.take_ping() {
+                    self.send(Message::Ping(Default::default())).await?;
+                },
+                message = next_news(&mut bulletin, &mut received, lets_long_news) => {
+                    if lets_long_news {
+                        long_news_sent = Instant::now();
+                    }
+                    self.send(message).await?;
+                }
+            }
+        }
+    }
+
     async fn greet(&mut self) -> Going {
         let hello = ServerMessage::Hello {
             protocol: PROTOCOL_VERSION,
@@ -72,74 +212,37 @@ impl Session<'_> {
             client: self.client,
             max_size_px: [MAX_SIZE_PX; 2],
             default_stages: &DEFAULT_STAGES,
+            clock_millis: self.site.clock.now_millis(),
         };
         self.say(&hello).await
     }
 
-    async fn answer(&mut self, message: Message) -> Going {
-        match message {
-            Message::Text(text) => match understand(&text) {
-                Ok(Understood::Order(order)) => {
-                    self.hub.order(self.client, *order);
-                    ControlFlow::Continue(())
-                }
-                Ok(Understood::SameVersion) => ControlFlow::Continue(()),
-                Ok(Understood::OtherVersion(theirs)) => {
-                    let reason = format!("this server speaks protocol {PROTOCOL_VERSION}, the client {theirs}");
-                    self.part(&reason).await
-                }
-                Ok(Understood::Goodbye) => self.part("the client leaves").await,
-                Err(error) => self.complain(id_of(&text), &error.to_string()).await,
-            },
-            Message::Binary(_) => self.complain(None, "binary messages are not understood, send JSON as text").await,
-            Message::Ping(_) | Message::Pong(_) => ControlFlow::Continue(()),
-            Message::Close(_) => ControlFlow::Break(()),
+    async fn reply(&mut self, reply: Reply) -> Going {
+        match reply {
+            Reply::Error { id, message } => self.complain(id, &message).await,
+            Reply::Pong { t } => {
+                let clock_millis = self.site.clock.now_millis();
+                self.say(&ServerMessage::Pong { t, clock_millis }).await
+            }
+            Reply::Goodbye { reason } => self.part(&reason).await,
         }
     }
 
-    async fn send_pictures(&mut self) -> Going {
-        while let Some(outgoing) = self.hub.collect(self.client) {
-            let sent = match outgoing {
-                Outgoing::Failed { id, reason } => self.complain(Some(id), &reason).await,
-                Outgoing::Picture(drawn) => {
-                    let id = drawn.0.order.id;
-                    let packed = tokio::task::spawn_blocking(move || {
-                        let (ticket, header, picture) = *drawn;
-                        pack_picture(&ticket.order, header, &picture)
-                    });
-                    match packed.await {
-                        Ok(Ok(bytes)) => self.send(Message::binary(bytes)).await,
-                        Ok(Err(error)) => self.complain(Some(id), &error.to_string()).await,
-                        Err(error) => self.complain(Some(id), &error.to_string()).await,
-                    }
-                }
-            };
-            self.hub.settle(self.client);
-            sent?;
+    async fn send_picture(&mut self, id: Option<u64>, packed: Packed) -> Going {
+        match packed {
+            Ok(Ok(bytes)) => self.send(Message::binary(bytes)).await,
+            Ok(Err(error)) => self.complain(id, &error.to_string()).await,
+            Err(error) => self.complain(id, &error.to_string()).await,
         }
-        ControlFlow::Continue(())
     }
 
-    async fn send_news(&mut self) -> Going {
-        if let Some(hint) = self.news.scene() {
-            self.say(&ServerMessage::from(&*hint)).await?;
-        }
-        if let Some(status) = self.news.status() {
+    /// The last status holds the result of the run.
+    async fn part_when_stopped(&mut self) -> Going {
+        let latest = self.site.hub.status().borrow().clone();
+        if let Some(status) = latest {
             self.say(&ServerMessage::Status(&status)).await?;
         }
-        if let Some(keyframes) = self.news.keyframes() {
-            let keyframes = keyframes.iter().map(KeyframeMessage::from).collect();
-            self.say(&ServerMessage::Keyframes { keyframes }).await?;
-        }
-        for slot in self.news.live_images() {
-            let packed = tokio::task::spawn_blocking(move || pack_live(&slot));
-            match packed.await {
-                Ok(Ok(bytes)) => self.send(Message::binary(bytes)).await?,
-                Ok(Err(error)) => self.complain(None, &error).await?,
-                Err(error) => self.complain(None, &error.to_string()).await?,
-            }
-        }
-        ControlFlow::Continue(())
+        self.part("the server has stopped").await
     }
 
     async fn complain(&mut self, id: Option<u64>, message: &str) -> Going {
@@ -157,7 +260,7 @@ impl Session<'_> {
     }
 
     async fn send(&mut self, message: Message) -> Going {
-        match self.socket.send(message).await {
+        match self.sink.send(message).await {
             Ok(()) => ControlFlow::Continue(()),
             Err(error) => {
                 log::debug!("client {}: {error}", self.client);
@@ -167,11 +270,45 @@ impl Session<'_> {
     }
 }
 
+/// An encoded picture, or why there is none.
+type Packed = Result<Result<Vec<u8>, Unsendable>, JoinError>;
+
+fn pack(drawn: Box<(crate::queue::Ticket, crate::protocol::PictureHeader, trainer::Picture)>) -> Packing {
+    let id = drawn.0.order.id;
+    let task = tokio::task::spawn_blocking(move || {
+        let (ticket, header, picture) = *drawn;
+        pack_picture(&ticket.order, header, &picture)
+    });
+    Packing { id, task }
+}
+
+/// Waits for the picture that is being encoded; forever if there is none.
+async fn finished(packing: &mut Option<Packing>) -> Packed {
+    match packing {
+        Some(packing) => (&mut packing.task).await,
+        None => std::future::pending().await,
+    }
+}
+
+/// Waits for a message that the client has not received.
+async fn next_news(bulletin: &mut watch::Receiver<Bulletin>, received: &mut Received, long: bool) -> Message {
+    loop {
+        if let Some(message) = bulletin.borrow_and_update().next(received, long) {
+            return message;
+        }
+        if bulletin.changed().await.is_err() {
+            // The server is about to stop.
+            std::future::pending::<()>().await;
+        }
+    }
+}
+
 /// What a client's text means.
 enum Understood {
     SameVersion,
     OtherVersion(u32),
     Order(Box<RenderOrder>),
+    Ping { t: f64 },
     Goodbye,
 }
 
@@ -180,6 +317,7 @@ fn understand(text: &str) -> Result<Understood, Malformed> {
         ClientMessage::Hello(hello) if hello.protocol == PROTOCOL_VERSION => Understood::SameVersion,
         ClientMessage::Hello(hello) => Understood::OtherVersion(hello.protocol),
         ClientMessage::Render(message) => Understood::Order(Box::new(RenderOrder::check(&message)?)),
+        ClientMessage::Ping(ping) => Understood::Ping { t: ping.t },
         ClientMessage::Goodbye(_) => Understood::Goodbye,
     })
 }
@@ -191,66 +329,4 @@ fn id_of(text: &str) -> Option<u64> {
         id: u64,
     }
     serde_json::from_str::<Numbered>(text).ok().map(|message| message.id)
-}
-
-fn pack_live(slot: &LiveSlot) -> Result<Vec<u8>, String> {
-    let jpeg = slot.jpeg.get_or_init(|| {
-        live_jpeg(&slot.image).map_err(|error| format!("live image of camera {:?}: {error}", slot.image.camera))
-    });
-    jpeg.as_deref().map(|jpeg| pack_live_image(&slot.image, jpeg)).map_err(Clone::clone)
-}
-
-/// What a client has not been told yet.
-struct News {
-    status: watch::Receiver<Option<Arc<Status>>>,
-    scene: watch::Receiver<Option<Arc<SceneHint>>>,
-    keyframes: watch::Receiver<Arc<[KeyframePose]>>,
-    live_images: watch::Receiver<LiveImages>,
-    /// The image last sent of each camera; holding it keeps its address from being used again.
-    sent_images: BTreeMap<Arc<str>, Arc<LiveSlot>>,
-}
-
-impl News {
-    fn subscribe(hub: &Hub) -> Self {
-        let mut news = Self {
-            status: hub.status(),
-            scene: hub.scene(),
-            keyframes: hub.keyframes(),
-            live_images: hub.live_images(),
-            sent_images: BTreeMap::new(),
-        };
-        // What was told before this client came is new to it.
-        news.status.mark_changed();
-        news.scene.mark_changed();
-        news.keyframes.mark_changed();
-        news.live_images.mark_changed();
-        news
-    }
-
-    fn status(&mut self) -> Option<Arc<Status>> {
-        fresh(&mut self.status).flatten()
-    }
-
-    fn scene(&mut self) -> Option<Arc<SceneHint>> {
-        fresh(&mut self.scene).flatten()
-    }
-
-    fn keyframes(&mut self) -> Option<Arc<[KeyframePose]>> {
-        fresh(&mut self.keyframes)
-    }
-
-    fn live_images(&mut self) -> Vec<Arc<LiveSlot>> {
-        let Some(images) = fresh(&mut self.live_images) else { return Vec::new() };
-        let is_new = |slot: &&Arc<LiveSlot>| {
-            self.sent_images.get(&slot.image.camera).is_none_or(|sent| !Arc::ptr_eq(sent, slot))
-        };
-        let new: Vec<_> = images.values().filter(is_new).cloned().collect();
-        self.sent_images = images;
-        new
-    }
-}
-
-/// The value, if it changed since the last call. An error would mean the hub is gone, which outlives the session.
-fn fresh<T: Clone>(receiver: &mut watch::Receiver<T>) -> Option<T> {
-    receiver.has_changed().unwrap_or(false).then(|| receiver.borrow_and_update().clone())
 }

@@ -4,20 +4,27 @@
 
 mod analytic_scene;
 mod browser;
+mod proxy;
 
 use analytic_scene::{draw, looking_along_y};
 use browser::{Browser, chromium};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
+use proxy::Proxy;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use trainer::{Projection, RenderRequest};
-use viz::{Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, SceneHint, Server, ServerConfig, Status};
+use viz::{Ended, Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, SceneHint, Server, ServerConfig, Status};
 
 const WINDOW_PX: [u32; 2] = [1280, 760];
+/// Sizes of the screenshots in `CARGO_TARGET_TMPDIR`.
+const DESKTOP_PX: [u32; 2] = [1280, 800];
+const PHONE_PX: [u32; 2] = [390, 844];
+/// The loss of the server is shown within this time.
+const LOSS_SHOWN_WITHIN_MILLIS: f64 = 1000.0;
 /// Far more than two busy cores need to draw the page in software.
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Whether a pixel has a share of the page's `--accent`, the color of live cameras; nothing else here is blue-green.
@@ -85,6 +92,21 @@ fn beside() -> KeyframePose {
     }
 }
 
+/// An image of the camera beside the scene, captured now.
+fn live_image(rgba: Arc<[u8]>) -> LiveImage {
+    let camera = beside();
+    LiveImage {
+        camera: Arc::clone(&camera.camera),
+        stamp: Stamp(1),
+        captured_at: Instant::now(),
+        size_px: camera.size_px,
+        pixels: LivePixels::Rgba(rgba),
+        world_from_camera: Some(camera.world_from_camera),
+        focal_px: camera.focal_px,
+        principal_px: camera.principal_px,
+    }
+}
+
 fn tell_news(hub: &Hub) {
     let live = beside();
     let request = RenderRequest {
@@ -97,16 +119,9 @@ fn tell_news(hub: &Hub) {
         crop: None,
         background_srgb: [0.1; 3],
         light_of: None,
+        depth: true,
     };
-    hub.set_live_image(LiveImage {
-        camera: Arc::clone(&live.camera),
-        stamp: Stamp(1),
-        size_px: live.size_px,
-        pixels: LivePixels::Rgba(draw(&request).rgba_srgb.into()),
-        world_from_camera: Some(live.world_from_camera),
-        focal_px: live.focal_px,
-        principal_px: live.principal_px,
-    });
+    hub.set_live_image(live_image(draw(&request).rgba_srgb.into()));
     let turned = |angle: f64| Transform::rotation(Vector3::new(0.0, 0.0, angle)) * live.world_from_camera;
     let keyframes = (1..12).map(|ix| KeyframePose { world_from_camera: turned(0.15 * f64::from(ix)), ..live.clone() });
     hub.set_keyframes(keyframes.collect());
@@ -132,6 +147,7 @@ fn tell_news(hub: &Hub) {
         },
         others: vec![ModelStatus { method: "tsdf".to_owned(), step: 143, ..ModelStatus::default() }],
         notes: Vec::new(),
+        ended: None,
     });
 }
 
@@ -277,6 +293,120 @@ fn check_reconnect(browser: &mut Browser, server: Server, hub: &Hub) {
     let server = Server::start(ServerConfig { listen }, hub.clone()).expect("the port is free again");
     wait_for(browser, "the return", |browser| browser.text("connection").contains("connected"));
     drop(server);
+}
+
+/// Runs the page through a link that is cut, as a wireless one is, and up to the end of the run.
+#[test]
+fn the_page_shows_a_lost_server_and_the_end_of_a_run() {
+    let bundle = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("web/dist/app.js");
+    let Some(program) = chromium().filter(|_| bundle.is_file()) else {
+        eprintln!("page test skipped: it needs Chromium and the bundled page (make web)");
+        return;
+    };
+    let hub = Hub::new();
+    tell_news(&hub);
+    let server = Server::start(ServerConfig { listen: ([127, 0, 0, 1], 0).into() }, hub.clone()).expect("a free port");
+    let painter = Painter::start(hub.clone());
+    let proxy = Proxy::start(server.address());
+    let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
+    let profile = scratch.join(format!("chromium-link-{}", std::process::id()));
+    let mut browser = Browser::open(&program, &profile, &format!("http://{}/", proxy.address()), DESKTOP_PX);
+    let camera = Camera::start(hub.clone());
+    wait_for(&mut browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
+    wait_for(&mut browser, "a live image", |browser| label(browser) == "live");
+    browser.evaluate(RECORDER);
+    assert_eq!(browser.text("banner"), "");
+    shoot(&mut browser, "connected");
+
+    browser.evaluate("record.cutAt = performance.now()");
+    proxy.cut();
+    std::thread::sleep(Duration::from_millis(1500));
+    assert!(browser.text("banner").starts_with("No data from the server for "), "{}", browser.text("banner"));
+    wait_for(&mut browser, "attempts to reconnect", |browser| browser.text("banner").contains("reconnecting"));
+    shoot(&mut browser, "lost");
+    camera.stop();
+    std::thread::sleep(Duration::from_millis(600)); // From here on, every image is too old to be live.
+    browser.evaluate("record.isLive = false");
+    proxy.mend();
+    wait_for(&mut browser, "the return", |browser| browser.text("connection").contains("connected"));
+    std::thread::sleep(Duration::from_millis(1500));
+    assert_eq!(browser.text("banner"), "");
+    let shown_after = browser.evaluate("record.shownAfter").as_f64().expect("the loss was shown");
+    assert!(shown_after < LOSS_SHOWN_WITHIN_MILLIS, "the loss was shown after {shown_after} ms");
+    assert_eq!(browser.evaluate("record.isLive"), false, "an image from before the cut was called live");
+    assert!(label(&mut browser).contains("old"), "{}", label(&mut browser));
+    let camera = Camera::start(hub.clone());
+    wait_for(&mut browser, "a live image", |browser| label(browser) == "live");
+    camera.stop();
+
+    hub.set_ended(Ended {
+        folder: Some("runs/2026-03-01-kitchen".to_owned()),
+        scores: "PSNR 26.76 dB".to_owned(),
+        seconds: 98.4,
+    });
+    drop(server);
+    wait_for(&mut browser, "the stopped server", |browser| {
+        browser.text("connection").contains("the server has stopped")
+    });
+    let expected = "Finished after 98 s: model saved in runs/2026-03-01-kitchen, PSNR 26.76 dB";
+    assert_eq!(browser.text("banner"), expected);
+    assert_eq!(browser.text("psnr"), "26.76", "the scores stay");
+    shoot(&mut browser, "finished");
+    drop(browser);
+    drop(painter);
+    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
+}
+
+/// Notes at every change of the page when the banner appears and whether a label says `live`.
+const RECORDER: &str = "
+    window.record = { cutAt: Infinity, shownAfter: null, isLive: false };
+    setInterval(() => {
+        if (record.shownAfter === null && document.getElementById('banner').textContent !== '')
+            record.shownAfter = performance.now() - record.cutAt;
+        for (const label of document.querySelectorAll('#live figcaption span'))
+            record.isLive ||= label.textContent === 'live';
+    }, 20)";
+
+/// What the page says about the age of the live image.
+fn label(browser: &mut Browser) -> String {
+    let label = browser.evaluate("document.querySelector('#live figcaption span')?.textContent ?? ''");
+    label.as_str().unwrap_or_default().to_owned()
+}
+
+/// Writes screenshots for both window sizes.
+fn shoot(browser: &mut Browser, name: &str) {
+    for (window, size_px) in [("phone", PHONE_PX), ("desktop", DESKTOP_PX)] {
+        browser.resize(size_px);
+        std::thread::sleep(Duration::from_millis(400));
+        let file = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("page-{name}-{window}.png"));
+        std::fs::write(file, browser.screenshot()).expect("written");
+    }
+}
+
+/// Sends live images ten times a second.
+struct Camera {
+    stop: Arc<AtomicBool>,
+    thread: std::thread::JoinHandle<()>,
+}
+
+impl Camera {
+    fn start(hub: Hub) -> Self {
+        let stop: Arc<AtomicBool> = Arc::default();
+        let stopped = Arc::clone(&stop);
+        let gray: Arc<[u8]> = vec![120; 640 * 480 * 4].into();
+        let thread = std::thread::spawn(move || {
+            while !stopped.load(Ordering::Relaxed) {
+                hub.set_live_image(live_image(Arc::clone(&gray)));
+                std::thread::sleep(Duration::from_millis(100));
+            }
+        });
+        Self { stop, thread }
+    }
+
+    fn stop(self) {
+        self.stop.store(true, Ordering::Relaxed);
+        self.thread.join().expect("no panic");
+    }
 }
 
 fn wait_for(browser: &mut Browser, what: &str, mut is_there: impl FnMut(&mut Browser) -> bool) {

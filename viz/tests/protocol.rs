@@ -171,6 +171,7 @@ fn request_of_stage(message: &Value, header: &Value) -> trainer::RenderRequest {
         crop: None,
         background_srgb: [0.0; 3],
         light_of: None,
+        depth: true,
     }
 }
 
@@ -288,6 +289,7 @@ fn live_images_reach_every_client_once_as_jpeg() {
     let image = |stamp| LiveImage {
         camera: "wrist".into(),
         stamp: Stamp(stamp),
+        captured_at: Instant::now(),
         size_px: [64, 48],
         pixels: LivePixels::Rgba(Arc::clone(&gradient)),
         world_from_camera: Some(Transform::identity()),
@@ -332,18 +334,21 @@ fn one_of_each() -> Vec<Value> {
     let (hub, server) = start();
     hub.set_status(Status { others: vec![learned("tsdf", 30)], ..Status::default() });
     hub.set_scene_hint(SceneHint { center_m: [0.0; 3], radius_m: 1.0, world_from_camera: Transform::identity() });
+    let mut client = Client::connect(server.address());
+    let mut messages = vec![client.text()];
+    messages.extend(["scene", "status", "keyframes", "heartbeat"].map(|kind| client.text_of(kind)));
+    client.say(&json!({"type": "ping", "t": 1.0}));
+    messages.push(client.text_of("pong"));
     hub.set_live_image(LiveImage {
         camera: "wrist".into(),
         stamp: Stamp(1),
+        captured_at: Instant::now(),
         size_px: [8, 8],
         pixels: LivePixels::Rgb(vec![0; 192].into()),
         world_from_camera: None,
         focal_px: [8.0; 2],
         principal_px: [4.0; 2],
     });
-    let mut client = Client::connect(server.address());
-    let mut messages = vec![client.text()];
-    messages.extend(["scene", "status", "keyframes"].map(|kind| client.text_of(kind)));
     messages.push(client.binary_of("live_image").0);
     client.say(&render_message(1));
     draw_all(&hub, 1);

@@ -37,6 +37,11 @@ fn is_nerfstudio(path: &Path) -> bool {
     path.is_file() || path.join(nerfstudio::FILE_NAME).is_file()
 }
 
+/// Whether `path` is a folder that [`read`] takes for a dataset; its contents are not checked.
+pub fn is_dataset_folder(path: &Path) -> bool {
+    [nerfstudio::FILE_NAME, tum::COLOR_LIST].iter().any(|name| path.join(name).is_file())
+}
+
 /// Reads a dataset folder of either kind; `path` may also name a `transforms.json`.
 pub fn read(path: &Path) -> Result<Dataset, Error> {
     if is_nerfstudio(path) {

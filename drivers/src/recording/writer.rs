@@ -2,9 +2,10 @@
 //!
 //! Chunks are closed at least once a second of sample time, so whatever stops the program costs at most that second.
 
+use super::reader::Recording;
 use super::topic::{Encoding, JOINT_NAMES, Topic};
 use crate::wire::{descriptor, foxglove, joint_state, point_cloud};
-use crate::{Error, Image, Kept, PixelFormat, Sample, TruthImage};
+use crate::{Error, Image, Kept, PixelFormat, Sample, Source, TruthImage};
 use kinematics::{Intrinsics, Stamp};
 use mcap::McapError;
 use mcap::records::MessageHeader;
@@ -33,7 +34,8 @@ pub struct About<'a> {
 /// A file in which no sample has arrived is removed when writing fails or ends.
 pub struct Recorder {
     path: PathBuf,
-    mcap: mcap::Writer<Box<dyn Sink>>,
+    /// None after a failure.
+    mcap: Option<mcap::Writer<Box<dyn Sink>>>,
     channels: BTreeMap<(Topic, &'static str), u16>,
     cameras: Vec<(String, Intrinsics)>,
     joint_names: String,
@@ -85,7 +87,7 @@ impl Recorder {
         mcap.flush().map_err(recorder)?;
         Ok(Self {
             path: path.to_owned(),
-            mcap,
+            mcap: Some(mcap),
             channels: BTreeMap::new(),
             cameras: about
                 .cameras
@@ -111,29 +113,36 @@ impl Recorder {
     ///
     /// Gives what was kept: everything.
     pub fn finish(mut self) -> Result<Kept, Error> {
-        self.close_chunk().map_err(|error| self.broken(error))?;
-        self.mcap.finish().map_err(|error| self.broken(error))?;
-        let Self { path, mcap, kept, .. } = self;
-        mcap.into_inner().flush().map_err(|source| Error::Record { path: path.clone(), kept, source })?;
-        if kept.n_samples == 0 {
-            remove_stub(&path);
-        }
-        Ok(kept)
-    }
-
-    /// What to say of a failure; a file that holds nothing goes.
-    fn broken(&self, error: McapError) -> Error {
+        let closed = self.close_chunk().and_then(|()| self.mcap()?.finish().map(drop));
+        closed.map_err(|error| self.broken(error))?;
+        let flushed = self.mcap.take().map_or(Ok(()), |mcap| mcap.into_inner().flush());
+        flushed.map_err(|error| self.broken(McapError::Io(error)))?;
         if self.kept.n_samples == 0 {
             remove_stub(&self.path);
+        }
+        Ok(self.kept)
+    }
+
+    fn mcap(&mut self) -> mcap::McapResult<&mut mcap::Writer<Box<dyn Sink>>> {
+        self.mcap.as_mut().ok_or_else(|| McapError::Io(std::io::Error::other("an earlier write failed")))
+    }
+
+    /// Closes the file after a failure; the error says how much of it a reader finds. A file that holds nothing is removed.
+    fn broken(&mut self, error: McapError) -> Error {
+        if self.mcap.take().is_some() {
+            // The chunk that broke off holds some samples, too: what counts is what a reader finds.
+            self.kept = readable(&self.path);
+            if self.kept.n_samples == 0 {
+                remove_stub(&self.path);
+            }
         }
         Error::Record { path: self.path.clone(), kept: self.kept, source: cause(error) }
     }
 
     /// Brings everything written so far into the file.
     fn close_chunk(&mut self) -> mcap::McapResult<()> {
-        self.mcap.flush()?;
-        let seconds = self.stamps.map_or(0.0, |[first, last]| (last.0 - first.0) as f64 * 1e-9);
-        self.kept = Kept { n_samples: self.n_samples, seconds };
+        self.mcap()?.flush()?;
+        self.kept = Kept { n_samples: self.n_samples, seconds: length_secs(self.stamps) };
         self.open_bytes = 0;
         Ok(())
     }
@@ -173,8 +182,7 @@ impl Recorder {
             Sample::Truth(truth) => self.put_truth(truth)?,
         }
         self.n_samples += 1;
-        let [first, last] = self.stamps.unwrap_or([stamp; 2]);
-        self.stamps = Some([first.min(stamp), last.max(stamp)]);
+        self.stamps = Some(with_stamp(self.stamps, stamp));
         let open_since = *self.open_since.get_or_insert(stamp);
         if self.open_bytes >= CHUNK_BYTES || stamp.0.saturating_sub(open_since.0) >= FLUSH_NANOS {
             self.close_chunk()?;
@@ -222,10 +230,10 @@ impl Recorder {
         if let Some(channel) = self.channels.get(&known) {
             return Ok(*channel);
         }
-        let schema = self.mcap.add_schema(encoding.schema_name, encoding.schema_encoding, &encoding.schema)?;
+        let schema = self.mcap()?.add_schema(encoding.schema_name, encoding.schema_encoding, &encoding.schema)?;
         let metadata =
             if key.is_empty() { BTreeMap::new() } else { BTreeMap::from([(key.to_owned(), value.to_owned())]) };
-        let channel = self.mcap.add_channel(schema, &known.0.name(), encoding.message_encoding, &metadata)?;
+        let channel = self.mcap()?.add_channel(schema, &known.0.name(), encoding.message_encoding, &metadata)?;
         self.channels.insert(known, channel);
         Ok(channel)
     }
@@ -236,7 +244,7 @@ impl Recorder {
         let header = MessageHeader { channel_id, sequence: self.n_messages, log_time, publish_time: log_time };
         self.n_messages = self.n_messages.wrapping_add(1);
         self.open_bytes += message.len() as u64;
-        self.mcap.write_to_known_channel(&header, message)
+        self.mcap()?.write_to_known_channel(&header, message)
     }
 }
 
@@ -247,6 +255,28 @@ impl std::fmt::Debug for Recorder {
             .field("n_messages", &self.n_messages)
             .finish_non_exhaustive()
     }
+}
+
+/// What can be read of a recording that was cut off.
+fn readable(path: &Path) -> Kept {
+    let (mut n_samples, mut stamps) = (0, None);
+    if let Ok(mut recording) = Recording::open(path) {
+        while let Ok(Some(sample)) = recording.next_sample() {
+            n_samples += 1;
+            stamps = Some(with_stamp(stamps, sample.stamp()));
+        }
+    }
+    Kept { n_samples, seconds: length_secs(stamps) }
+}
+
+/// The range of stamps with one more.
+fn with_stamp(range: Option<[Stamp; 2]>, stamp: Stamp) -> [Stamp; 2] {
+    let [first, last] = range.unwrap_or([stamp; 2]);
+    [first.min(stamp), last.max(stamp)]
+}
+
+fn length_secs(range: Option<[Stamp; 2]>) -> f64 {
+    range.map_or(0.0, |[first, last]| (last.0 - first.0) as f64 * 1e-9)
 }
 
 /// The file's own error where there is one: the rest is the format's, and says less.
@@ -278,8 +308,6 @@ fn media_type_of(name: &str) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Source;
-    use crate::recording::Recording;
     use kinematics::JointState;
     use std::io::{Error as IoError, SeekFrom};
 
@@ -323,7 +351,7 @@ mod tests {
         };
         let told = (0..20_000).map(|ix| recorder.write(&reading(ix))).find_map(Result::err).expect("the disk is full");
         let Error::Record { kept, .. } = told else { panic!("{told}") };
-        let sentence = format!("run.mcap\", which keeps the first 1.0 s ({} samples)", kept.n_samples);
+        let sentence = format!("run.mcap\", which keeps the first {:.1} s ({} samples)", kept.seconds, kept.n_samples);
         assert!(told.to_string().ends_with(&sentence), "{told}");
         let cause = std::error::Error::source(&told).map(ToString::to_string);
         assert!(cause.is_some_and(|cause| cause.contains("no storage space")), "{told:?}");
@@ -335,8 +363,9 @@ mod tests {
             assert_eq!(sample, reading(n_samples));
             n_samples += 1;
         }
-        // The chunk that broke off may give a few more.
-        assert!(kept.n_samples > 1000 && n_samples.unsigned_abs() >= kept.n_samples, "{n_samples} of {kept:?}");
+        // The chunk that broke off counts, too: what is reported is what a reader finds.
+        assert!(kept.n_samples > 1000 && n_samples.unsigned_abs() == kept.n_samples, "{n_samples} of {kept:?}");
+        assert!((kept.seconds - 1e-3 * (kept.n_samples - 1) as f64).abs() < 1e-9, "{kept:?}");
         assert!(recording.damage().is_some());
     }
 

@@ -5,6 +5,7 @@ mod budget;
 mod curve;
 mod field;
 mod kernels;
+mod memory;
 mod stability;
 mod stamps;
 
@@ -35,6 +36,8 @@ enum What {
     Stability(stability::Args),
     /// How far from the shutter the stamps of images are that come late and by another clock, as a histogram
     Stamps(stamps::Args),
+    /// Resident memory of a long run, by parts, and how fast it grows once the keyframe store is full
+    Memory(memory::Args),
 }
 
 /// Names and milliseconds of passes, where they are asked for.
@@ -51,5 +54,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         What::Ablation(args) => ablation::run(args),
         What::Stability(args) => stability::run(args),
         What::Stamps(args) => stamps::run(args),
+        What::Memory(args) => memory::run(args),
     }
 }

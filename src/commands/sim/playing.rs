@@ -77,17 +77,17 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     told.extend(played.told.iter().cloned());
     if args.json {
         let (starts_in_secs, seconds) = (args.start_in, args.seconds);
-        print::json(&Ready { event: "ready", rig: &rig_file, starts_in_secs, seconds, playing: &told })?;
+        print::report_json(&Ready { event: "ready", rig: &rig_file, starts_in_secs, seconds, playing: &told })?;
     } else {
         for device in &told {
-            print::line(device)?;
+            print::report(device);
         }
-        print::line(format_args!(
+        print::report(format_args!(
             "Playing {:.1} s, which begins in {:.1} s. In another terminal: fieldrig run {}",
             args.seconds,
             args.start_in,
             rig_file.display()
-        ))?;
+        ));
     }
     wait(&stop, clockwork.played, args)?;
     Ok(Exit::Done)
@@ -274,8 +274,8 @@ fn wait(stop: &Stop, begins: Stamp, args: &Args) -> anyhow::Result<()> {
         });
         if secs >= args.seconds && !std::mem::replace(&mut is_over, true) {
             match args.json {
-                true => print::json(&serde_json::json!({ "event": "over" }))?,
-                false => print::line("Played to the end: everything stands still, and answers until Ctrl-C.")?,
+                true => print::report_json(&serde_json::json!({ "event": "over" }))?,
+                false => print::report("Played to the end: everything stands still, and answers until Ctrl-C."),
             }
         }
         std::thread::sleep(POLL);

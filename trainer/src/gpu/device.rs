@@ -2,8 +2,16 @@
 
 use super::Optional;
 use crate::Error;
-use std::sync::Arc;
+use std::collections::{BTreeMap, VecDeque};
+use std::ops::Range;
+use std::panic::AssertUnwindSafe;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::RecvTimeoutError;
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::time::Duration;
+
+/// While a read-back does not arrive, the device is checked this often.
+const CHECK_EVERY: Duration = Duration::from_millis(100);
 
 /// How to choose the adapter.
 #[derive(Clone, Copy, Debug)]
@@ -16,15 +24,29 @@ pub struct GpuOptions {
     pub float_atomics: bool,
     /// Lowers the largest binding, bytes; for tests of buffer limits.
     pub max_binding_bytes: Option<u64>,
+    /// Bytes of all storage buffers together, past which the GPU counts as full; for tests of running out of memory.
+    pub memory_limit_bytes: Option<u64>,
     /// Which of [`Gpu::adapters`]; else the fastest.
     pub adapter: Option<usize>,
 }
 
 impl Default for GpuOptions {
     fn default() -> Self {
-        Self { optional_features: true, matrices: true, float_atomics: false, max_binding_bytes: None, adapter: None }
+        Self {
+            optional_features: true,
+            matrices: true,
+            float_atomics: false,
+            max_binding_bytes: None,
+            memory_limit_bytes: None,
+            adapter: None,
+        }
     }
 }
+
+/// Bytes of read-back buffers that are kept for the next read: a picture of 1024x1024 with depth takes 8 MiB.
+const MAX_IDLE_STAGING_BYTES: u64 = 32 << 20;
+/// Read-back buffers that are kept for the next read.
+const MAX_IDLE_STAGING: usize = 8;
 
 /// One GPU, real or software.
 #[derive(Debug)]
@@ -34,9 +56,78 @@ pub struct Gpu {
     pub(super) optional: Optional,
     info: wgpu::AdapterInfo,
     limits: wgpu::Limits,
-    live_bytes: Arc<AtomicU64>,
+    memory_limit_bytes: u64,
+    health: Arc<Health>,
+    live: Arc<Live>,
     peak_bytes: AtomicU64,
     next_id: AtomicU64,
+    /// Read-back buffers to use again, the oldest first.
+    idle_staging: Mutex<VecDeque<wgpu::Buffer>>,
+}
+
+/// Bytes of live buffers.
+#[derive(Debug, Default)]
+struct Live {
+    bytes: AtomicU64,
+    by_label: Mutex<BTreeMap<Arc<str>, u64>>,
+}
+
+impl Live {
+    /// Counts a new buffer; returns its label and the bytes of all.
+    fn add(&self, label: &str, bytes: u64) -> (Arc<str>, u64) {
+        let mut by_label = self.by_label.lock().unwrap_or_else(PoisonError::into_inner);
+        let key = by_label.get_key_value(label).map_or_else(|| label.into(), |(key, _)| Arc::clone(key));
+        *by_label.entry(Arc::clone(&key)).or_default() += bytes;
+        (key, self.bytes.fetch_add(bytes, Ordering::Relaxed) + bytes)
+    }
+
+    fn remove(&self, label: &str, bytes: u64) {
+        let mut by_label = self.by_label.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(of_label) = by_label.get_mut(label) {
+            *of_label -= bytes;
+        }
+        self.bytes.fetch_sub(bytes, Ordering::Relaxed);
+    }
+}
+
+/// What the device reports outside of any call. Neither is taken back: afterwards only another device is of use.
+#[derive(Debug, Default)]
+struct Health {
+    /// Why the device was lost.
+    lost: OnceLock<String>,
+    /// The first error that no error scope caught.
+    failed: OnceLock<Failure>,
+}
+
+#[derive(Debug)]
+enum Failure {
+    OutOfMemory,
+    Rejected(String),
+}
+
+impl Health {
+    fn note(&self, error: wgpu::Error) {
+        let failure = match error {
+            wgpu::Error::OutOfMemory { .. } => Failure::OutOfMemory,
+            wgpu::Error::Validation { description, .. } | wgpu::Error::Internal { description, .. } => {
+                Failure::Rejected(description)
+            }
+        };
+        self.failed.get_or_init(|| failure);
+    }
+
+    /// Watches a device.
+    fn of(device: &wgpu::Device) -> Arc<Self> {
+        let health = Arc::<Self>::default();
+        let (on_loss, on_error) = (health.clone(), health.clone());
+        device.set_device_lost_callback(move |reason, message| {
+            log::debug!("the device was lost ({reason:?}): {message}");
+            on_loss.lost.get_or_init(|| message);
+        });
+        // Without a handler wgpu panics.
+        device.on_uncaptured_error(Arc::new(move |error| on_error.note(error)));
+        health
+    }
 }
 
 /// Where compute kernels run.
@@ -102,15 +193,19 @@ impl Gpu {
             ..wgpu::DeviceDescriptor::default()
         }))
         .map_err(|source| Error::NoDevice { adapter: adapter.get_info().name, source })?;
+        let health = Health::of(&device);
         Ok(Arc::new(Self {
             device,
             queue,
             optional,
             info: adapter.get_info(),
             limits,
-            live_bytes: Arc::default(),
+            memory_limit_bytes: options.memory_limit_bytes.unwrap_or(u64::MAX),
+            health,
+            live: Arc::default(),
             peak_bytes: AtomicU64::new(0),
             next_id: AtomicU64::new(0),
+            idle_staging: Mutex::default(),
         }))
     }
 
@@ -149,7 +244,13 @@ impl Gpu {
 
     /// Bytes of all live buffers.
     pub fn live_bytes(&self) -> u64 {
-        self.live_bytes.load(Ordering::Relaxed)
+        self.live.bytes.load(Ordering::Relaxed)
+    }
+
+    /// Bytes of all live buffers by their labels.
+    pub fn live_bytes_by_label(&self) -> BTreeMap<Arc<str>, u64> {
+        let by_label = self.live.by_label.lock().unwrap_or_else(PoisonError::into_inner);
+        by_label.iter().filter(|(_, bytes)| **bytes > 0).map(|(label, bytes)| (Arc::clone(label), *bytes)).collect()
     }
 
     /// Largest value of [`Self::live_bytes`] so far.
@@ -157,7 +258,33 @@ impl Gpu {
         self.peak_bytes.load(Ordering::Relaxed)
     }
 
-    /// A zeroed storage buffer; refused when the adapter cannot bind it.
+    /// Bytes that the allocator holds for buffers, used or not; `None` where the backend does not report it. Takes a moment: it
+    /// lists every allocation.
+    pub fn reserved_bytes(&self) -> Option<u64> {
+        Some(self.device.generate_allocator_report()?.total_reserved_bytes)
+    }
+
+    /// Whether the device was lost: nothing that was made on it can be used any more.
+    pub fn is_lost(&self) -> bool {
+        self.health.lost.get().is_some()
+    }
+
+    /// An error where the device was lost, ran out of memory or rejected a command since it was opened.
+    pub fn check(&self) -> Result<(), Error> {
+        match self.health.failed.get() {
+            Some(Failure::OutOfMemory) => Err(Error::OutOfMemory { label: String::new(), bytes: 0 }),
+            _ if self.is_lost() => Err(Error::DeviceLost),
+            Some(Failure::Rejected(message)) => Err(Error::Rejected(message.clone())),
+            None => Ok(()),
+        }
+    }
+
+    /// Loses the device on purpose, as a reset of the driver does: for tests of what happens then.
+    pub fn lose(&self) {
+        self.device.destroy();
+    }
+
+    /// A zeroed storage buffer; refused when the adapter cannot bind it, or has no memory left for it.
     pub fn storage(&self, label: &str, bytes: u64) -> Result<Buffer, Error> {
         let bytes = bytes.max(16).next_multiple_of(16);
         if bytes > self.max_binding_bytes() {
@@ -167,8 +294,14 @@ impl Gpu {
                 limit_bytes: self.max_binding_bytes(),
             });
         }
+        let full = || Error::OutOfMemory { label: label.to_owned(), bytes };
+        if self.live_bytes().saturating_add(bytes) > self.memory_limit_bytes {
+            return Err(full());
+        }
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST;
-        Ok(self.buffer(label, bytes, usage))
+        let memory = self.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
+        let buffer = self.buffer(label, bytes, usage);
+        pollster::block_on(memory.pop()).map_or(Ok(buffer), |_| Err(full()))
     }
 
     /// A storage buffer holding `contents`.
@@ -223,39 +356,98 @@ impl Gpu {
         if n == 0 {
             return Ok(Vec::new());
         }
-        self.begin_read_bytes(buffer, n * size_of::<T>()).finish(self)
+        self.submit_reading(self.encoder(), &[(buffer, n * size_of::<T>())]).finish(self)
     }
 
     /// Begins to read the first `n` words of `buffer` as they are after everything submitted so far.
     pub fn begin_read(&self, buffer: &Buffer, n: usize) -> PendingRead {
-        self.begin_read_bytes(buffer, 4 * n)
+        self.submit_reading(self.encoder(), &[(buffer, 4 * n)])
     }
 
-    fn begin_read_bytes(&self, buffer: &Buffer, n_bytes: usize) -> PendingRead {
-        let padded = (n_bytes as u64).next_multiple_of(4);
-        let staging = self.device.create_buffer(&wgpu::BufferDescriptor {
-            label: Some("readback"),
-            size: padded,
-            usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
-            mapped_at_creation: false,
-        });
-        let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
-        encoder.copy_buffer_to_buffer(&buffer.raw, 0, &staging, 0, padded);
+    pub(super) fn encoder(&self) -> wgpu::CommandEncoder {
+        self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default())
+    }
+
+    /// Submits what was encoded, with a copy of the first bytes of each of these buffers behind it: all of them in one
+    /// read-back, which is one wait and one mapping.
+    pub(super) fn submit_reading(&self, mut encoder: wgpu::CommandEncoder, wanted: &[(&Buffer, usize)]) -> PendingRead {
+        let padded = |n_bytes: usize| n_bytes.next_multiple_of(4);
+        let n_all_bytes = wanted.iter().map(|(_, n_bytes)| padded(*n_bytes) as u64).sum();
+        let Some(staging) = self.staging(n_all_bytes) else {
+            self.queue.submit([encoder.finish()]); // What was encoded is done all the same.
+            return PendingRead(Err(n_all_bytes));
+        };
+        let mut parts = Vec::with_capacity(wanted.len());
+        let mut begin = 0;
+        for (buffer, n_bytes) in wanted {
+            encoder.copy_buffer_to_buffer(&buffer.raw, 0, &staging, begin as u64, padded(*n_bytes) as u64);
+            parts.push(begin..begin + n_bytes);
+            begin += padded(*n_bytes);
+        }
         let submission = self.queue.submit([encoder.finish()]);
         let (sender, mapped) = std::sync::mpsc::sync_channel(1);
         staging.map_async(wgpu::MapMode::Read, .., move |result| {
             // Nobody listens any more when the read was given up.
             let _ = sender.send(result);
         });
-        PendingRead { staging, submission, mapped, n_bytes }
+        PendingRead(Ok(Reading { staging, submission, mapped, parts }))
+    }
+
+    /// A buffer to read back into: one that was used before where one fits; `None` where no memory is left for it.
+    fn staging(&self, bytes: u64) -> Option<wgpu::Buffer> {
+        let bytes = bytes.max(4);
+        let mut idle = self.idle_staging.lock().unwrap_or_else(PoisonError::into_inner);
+        let fits = |buffer: &wgpu::Buffer| (bytes..=4 * bytes).contains(&buffer.size());
+        let found = idle.iter().enumerate().filter(|(_, buffer)| fits(buffer)).min_by_key(|(_, buffer)| buffer.size());
+        if let Some(buffer) = found.map(|(ix, _)| ix).and_then(|ix| idle.remove(ix)) {
+            return Some(buffer);
+        }
+        drop(idle);
+        let memory = self.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
+        let staging = self.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("readback"),
+            size: bytes,
+            usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
+        pollster::block_on(memory.pop()).is_none().then_some(staging)
+    }
+
+    #[cfg(test)]
+    pub(super) fn n_idle_staging(&self) -> usize {
+        self.idle_staging.lock().unwrap_or_else(PoisonError::into_inner).len()
+    }
+
+    /// Keeps a read-back buffer for the next read, within [`MAX_IDLE_STAGING_BYTES`]; those unused longest go first.
+    fn keep_staging(&self, buffer: wgpu::Buffer) {
+        let mut idle = self.idle_staging.lock().unwrap_or_else(PoisonError::into_inner);
+        idle.push_back(buffer);
+        while idle.len() > MAX_IDLE_STAGING || idle.iter().map(wgpu::Buffer::size).sum::<u64>() > MAX_IDLE_STAGING_BYTES
+        {
+            idle.pop_front();
+        }
     }
 
     /// Waits until everything submitted is done.
     pub fn wait(&self) -> Result<(), Error> {
-        self.device
-            .poll(wgpu::PollType::Wait { submission_index: None, timeout: None })
-            .map_err(|_| Error::DeviceLost)?;
-        Ok(())
+        self.poll(wgpu::PollType::Wait { submission_index: None, timeout: None })?;
+        self.check()
+    }
+
+    fn poll(&self, until: wgpu::PollType) -> Result<(), Error> {
+        // wgpu panics where it finds out while it waits that the driver lost the device.
+        let polled = std::panic::catch_unwind(AssertUnwindSafe(|| self.device.poll(until)));
+        match polled {
+            Ok(Ok(_)) => Ok(()),
+            Ok(Err(_)) => Err(self.failure()),
+            Err(_) if self.is_lost() => Err(self.failure()),
+            Err(panic) => std::panic::resume_unwind(panic),
+        }
+    }
+
+    /// Why something failed that fails on a lost device only.
+    fn failure(&self) -> Error {
+        self.check().err().unwrap_or(Error::DeviceLost)
     }
 
     pub(super) fn fresh_id(&self) -> u64 {
@@ -269,29 +461,56 @@ impl Gpu {
             usage,
             mapped_at_creation: false,
         });
-        let live = self.live_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes;
-        self.peak_bytes.fetch_max(live, Ordering::Relaxed);
-        Buffer { id: self.fresh_id(), raw, bytes, live_bytes: self.live_bytes.clone() }
+        let (label, live_bytes) = self.live.add(label, bytes);
+        self.peak_bytes.fetch_max(live_bytes, Ordering::Relaxed);
+        Buffer { id: self.fresh_id(), raw, bytes, label, live: self.live.clone() }
     }
 }
 
-/// A read-back under way.
+/// A read-back under way; an error is the size of a buffer that found no memory, bytes.
 #[derive(Debug)]
-pub struct PendingRead {
+pub struct PendingRead(Result<Reading, u64>);
+
+#[derive(Debug)]
+struct Reading {
     staging: wgpu::Buffer,
     submission: wgpu::SubmissionIndex,
     mapped: std::sync::mpsc::Receiver<Result<(), wgpu::BufferAsyncError>>,
-    n_bytes: usize,
+    /// Of each buffer that is read, in the staging buffer.
+    parts: Vec<Range<usize>>,
 }
 
 impl PendingRead {
-    /// Waits for the data.
+    /// Waits for the data of a read of one buffer.
     pub fn finish<T: bytemuck::Pod>(self, gpu: &Gpu) -> Result<Vec<T>, Error> {
-        let wait = wgpu::PollType::Wait { submission_index: Some(self.submission), timeout: None };
-        gpu.device.poll(wait).map_err(|_| Error::DeviceLost)?;
-        self.mapped.recv().map_err(|_| Error::DeviceLost)?.map_err(|_| Error::DeviceLost)?;
-        let view = self.staging.get_mapped_range(..).map_err(|_| Error::DeviceLost)?;
-        Ok(bytemuck::pod_collect_to_vec(&view[..self.n_bytes]))
+        self.finish_with(gpu, |parts| bytemuck::pod_collect_to_vec(parts[0]))
+    }
+
+    /// Waits for the data and passes the bytes of each buffer, in the order they were asked for, to `take`.
+    pub fn finish_with<R>(self, gpu: &Gpu, take: impl FnOnce(&[&[u8]]) -> R) -> Result<R, Error> {
+        let reading = self.0.map_err(|bytes| Error::OutOfMemory { label: "readback".to_owned(), bytes })?;
+        let Reading { staging, submission, mapped, parts } = reading;
+        gpu.poll(wgpu::PollType::Wait { submission_index: Some(submission), timeout: None })?;
+        let is_mapped = loop {
+            // Another thread that waits too may be the one that passes it on, and a lost device may never do so.
+            match mapped.recv_timeout(CHECK_EVERY) {
+                Ok(result) => break result.is_ok(),
+                Err(RecvTimeoutError::Timeout) => gpu.check()?,
+                Err(RecvTimeoutError::Disconnected) => break false,
+            }
+        };
+        if !is_mapped {
+            return Err(gpu.failure());
+        }
+        let view = staging.get_mapped_range(..).map_err(|_| gpu.failure())?;
+        gpu.check()?;
+        let read: Vec<&[u8]> = parts.iter().map(|part| &view[part.clone()]).collect();
+        let taken = take(&read);
+        drop(read);
+        drop(view);
+        staging.unmap();
+        gpu.keep_staging(staging);
+        Ok(taken)
     }
 }
 
@@ -301,7 +520,8 @@ pub struct Buffer {
     pub(super) id: u64,
     pub(super) raw: wgpu::Buffer,
     bytes: u64,
-    live_bytes: Arc<AtomicU64>,
+    label: Arc<str>,
+    live: Arc<Live>,
 }
 
 impl Buffer {
@@ -313,6 +533,23 @@ impl Buffer {
 
 impl Drop for Buffer {
     fn drop(&mut self) {
-        self.live_bytes.fetch_sub(self.bytes, Ordering::Relaxed);
+        self.live.remove(&self.label, self.bytes);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn live_bytes_are_counted_by_label() {
+        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let kept = gpu.storage("kept", 64).unwrap();
+        let dropped: Vec<Buffer> = (0..3).map(|_| gpu.storage("dropped", 32).unwrap()).collect();
+        assert_eq!(gpu.live_bytes_by_label(), BTreeMap::from([("dropped".into(), 96), ("kept".into(), 64)]));
+        drop(dropped);
+        assert_eq!(gpu.live_bytes_by_label(), BTreeMap::from([("kept".into(), kept.bytes())]));
+        assert_eq!((gpu.live_bytes(), gpu.peak_bytes()), (64, 160));
+        assert!(gpu.reserved_bytes().is_none_or(|bytes| bytes >= 64));
     }
 }

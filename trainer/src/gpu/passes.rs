@@ -1,6 +1,6 @@
 //! Lists of passes, and the only code that encodes them.
 
-use super::{Buffer, Gpu, Pipeline};
+use super::{Buffer, Gpu, PendingRead, Pipeline};
 use crate::Error;
 use std::collections::HashMap;
 use std::ops::Range;
@@ -20,6 +20,7 @@ pub struct PassTiming {
 enum Pass {
     Dispatch { pipeline: wgpu::ComputePipeline, bind_group: wgpu::BindGroup, groups: [u32; 2], name: &'static str },
     Clear { buffer: wgpu::Buffer, bytes: Range<u64> },
+    Copy { from: (wgpu::Buffer, u64), to: (wgpu::Buffer, u64), bytes: u64 },
 }
 
 /// A list of GPU passes; listing them does not touch the GPU.
@@ -37,6 +38,7 @@ impl std::fmt::Debug for Passes {
             .entries(self.list.iter().map(|pass| match pass {
                 Pass::Dispatch { name, groups, .. } => format!("{name} {}x{}", groups[0], groups[1]),
                 Pass::Clear { .. } => "clear".to_owned(),
+                Pass::Copy { .. } => "copy".to_owned(),
             }))
             .finish()
     }
@@ -96,6 +98,13 @@ impl Passes {
         self.list.push(Pass::Clear { buffer: buffer.raw.clone(), bytes });
     }
 
+    /// Adds a copy of some bytes from one buffer to another; offsets and number are multiples of 4.
+    pub fn copy(&mut self, from: (&Buffer, u64), to: (&Buffer, u64), bytes: u64) {
+        if bytes > 0 {
+            self.list.push(Pass::Copy { from: (from.0.raw.clone(), from.1), to: (to.0.raw.clone(), to.1), bytes });
+        }
+    }
+
     /// Number of passes listed.
     pub fn len(&self) -> usize {
         self.list.len()
@@ -113,9 +122,17 @@ impl Passes {
 
     /// Sends the list to the GPU and empties it.
     pub fn submit(&mut self, gpu: &Gpu) {
-        let mut encoder = gpu.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        let mut encoder = gpu.encoder();
         encode_all(&mut encoder, self.list.drain(..));
         gpu.queue.submit([encoder.finish()]);
+    }
+
+    /// Sends the list to the GPU, empties it, and begins to read the first bytes of each of these buffers as the list leaves
+    /// them: one submit and one read-back for all.
+    pub fn submit_reading(&mut self, gpu: &Gpu, wanted: &[(&Buffer, usize)]) -> PendingRead {
+        let mut encoder = gpu.encoder();
+        encode_all(&mut encoder, self.list.drain(..));
+        gpu.submit_reading(encoder, wanted)
     }
 
     /// Sends the list, waits, and tells the GPU time from the first pass's beginning to the last one's end, milliseconds.
@@ -177,9 +194,7 @@ impl Passes {
         let mut names = Vec::new();
         for pass in self.list.drain(..) {
             match &pass {
-                Pass::Clear { buffer, bytes } => {
-                    encoder.clear_buffer(buffer, bytes.start, Some(bytes.end - bytes.start))
-                }
+                Pass::Clear { .. } | Pass::Copy { .. } => transfer(&mut encoder, &pass),
                 Pass::Dispatch { name, .. } => {
                     let ix = u32_of(names.len() as u64);
                     let mut compute = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
@@ -225,7 +240,7 @@ fn encode_all(encoder: &mut wgpu::CommandEncoder, list: impl Iterator<Item = Pas
     let mut passes = list.peekable();
     while let Some(pass) = passes.next() {
         match pass {
-            Pass::Clear { buffer, bytes } => encoder.clear_buffer(&buffer, bytes.start, Some(bytes.end - bytes.start)),
+            Pass::Clear { .. } | Pass::Copy { .. } => transfer(encoder, &pass),
             first @ Pass::Dispatch { .. } => {
                 let mut compute = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
                 encode(&mut compute, &first);
@@ -234,6 +249,15 @@ fn encode_all(encoder: &mut wgpu::CommandEncoder, list: impl Iterator<Item = Pas
                 }
             }
         }
+    }
+}
+
+/// Encodes a pass that runs no kernel.
+fn transfer(encoder: &mut wgpu::CommandEncoder, pass: &Pass) {
+    match pass {
+        Pass::Dispatch { .. } => {}
+        Pass::Clear { buffer, bytes } => encoder.clear_buffer(buffer, bytes.start, Some(bytes.end - bytes.start)),
+        Pass::Copy { from, to, bytes } => encoder.copy_buffer_to_buffer(&from.0, from.1, &to.0, to.1, *bytes),
     }
 }
 
@@ -246,4 +270,31 @@ fn encode(compute: &mut wgpu::ComputePass<'_>, pass: &Pass) {
 
 fn u32_of(value: u64) -> u32 {
     u32::try_from(value).expect("workgroup counts are folded below 2^16 an axis")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::GpuOptions;
+
+    #[test]
+    fn several_buffers_come_back_in_one_read_and_memory_for_it_is_used_again() {
+        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let first = gpu.storage_with("first", &[1, 2, 3, 4, 5, 6, 7, 8]).unwrap();
+        let second = gpu.storage_with("second", bytemuck::cast_slice(&[0.5f32; 1000])).unwrap();
+        let mut list = Passes::default();
+        for n in [3, 1000, 2, 1000] {
+            // A copy within the list comes before the read.
+            list.copy((&second, 0), (&first, 4), 4);
+            let read = list.submit_reading(&gpu, &[(&first, 7), (&second, 4 * n)]);
+            assert!(list.is_empty());
+            let (bytes, floats) = read
+                .finish_with(&gpu, |parts| (parts[0].to_vec(), bytemuck::pod_collect_to_vec::<u8, f32>(parts[1])))
+                .unwrap();
+            let half = 0.5f32.to_le_bytes();
+            assert_eq!(bytes, [1, 2, 3, 4, half[0], half[1], half[2]], "whole words are copied, bytes are returned");
+            assert_eq!(floats, vec![0.5; n]);
+        }
+        assert_eq!(gpu.n_idle_staging(), 2, "one for small reads, one for large ones");
+    }
 }

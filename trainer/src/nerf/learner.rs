@@ -350,8 +350,7 @@ impl Learner {
 
     /// Sends what is listed; the read tells when it is done.
     pub(crate) fn submit(&mut self, gpu: &Gpu) -> PendingRead {
-        self.passes.submit(gpu);
-        gpu.begin_read(&self.samples.batch, 2)
+        self.passes.submit_reading(gpu, &[(&self.samples.batch, 8)])
     }
 
     /// Sends what is listed with a timestamp around each pass.
@@ -424,6 +423,7 @@ impl Learner {
         background_srgb: [f32; 3],
         radius_m: f64,
         code: [f64; N_CODE],
+        depth: bool,
     ) -> Result<Picture, Error> {
         let n_pixels = camera.size_px[0] as usize * camera.size_px[1] as usize;
         self.make_canvas(gpu, n_pixels as u64)?;
@@ -449,15 +449,14 @@ impl Learner {
                     of_pixels.colors(list);
                     of_pixels.show(list, canvas);
                 }
-                list.submit(gpu);
-                if gpu.read::<u32>(&samples.batch, 2)?[1] == 0 {
+                if list.submit_reading(gpu, &[(&samples.batch, 8)]).finish::<u32>(gpu)?[1] == 0 {
                     break;
                 }
             }
         }
-        let pixels: Vec<u32> = gpu.read(&canvas.pixels, n_pixels)?;
-        let depth_m = gpu.read(&canvas.depths, n_pixels)?;
-        Ok(Picture { size_px: camera.size_px, rgba_srgb: bytemuck::cast_slice(&pixels).to_vec(), depth_m })
+        let wanted = Picture::buffers(camera.size_px, &canvas.pixels, depth.then_some(&canvas.depths));
+        let read = list.submit_reading(gpu, &wanted);
+        read.finish_with(gpu, |parts| Picture::of_parts(camera.size_px, parts))
     }
 
     fn make_canvas(&mut self, gpu: &Gpu, n_pixels: u64) -> Result<(), Error> {

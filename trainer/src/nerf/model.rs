@@ -12,6 +12,7 @@ use super::sizes::Sizes;
 use crate::align::Alignment;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming, PendingRead};
+use crate::method::submit_millis;
 use crate::splat::{Camera, CameraFix, N_CODE, PosedLens, TermSet, projections};
 use crate::{Error, Keyframe, Method, Part, Picture, Progress, RenderRequest, Renewable, Split};
 use images::Trials;
@@ -22,8 +23,6 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// GPU time that a submit may take, milliseconds.
-const MOST_SUBMIT_MILLIS: f64 = 20.0;
 /// Nearest place that rays look at, in units of the scene's radius.
 const BEGIN: f32 = 0.03;
 /// Cells of the occupancy become finer after one of so many of the planned steps: before a trial, which compares fields of one size.
@@ -58,6 +57,8 @@ pub struct NerfModel {
     /// Steps of trials that were taken back.
     n_taken_back: u64,
     step_millis: f64,
+    /// Whether pictures are asked for.
+    is_watched: bool,
 }
 
 #[derive(Debug)]
@@ -87,6 +88,7 @@ impl NerfModel {
             in_flight: None,
             step: 0,
             step_millis: 0.0,
+            is_watched: false,
         })
     }
 
@@ -227,15 +229,16 @@ impl NerfModel {
             return 1;
         }
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
-        let n = (MOST_SUBMIT_MILLIS / self.step_millis).clamp(1.0, STEPS_PER_SUBMIT as f64) as u64;
+        let n = (submit_millis(self.is_watched) / self.step_millis).clamp(1.0, STEPS_PER_SUBMIT as f64) as u64;
         n
     }
 
-    fn draw(&mut self, camera: &Camera, background_srgb: [f32; 3], code: [f64; N_CODE]) -> Result<Picture, Error> {
+    fn draw(&mut self, request: &RenderRequest, camera: &Camera, code: [f64; N_CODE]) -> Result<Picture, Error> {
+        let RenderRequest { background_srgb, depth, .. } = *request;
         let Some((extent, learner)) = &mut self.field else {
-            return Ok(Picture::empty(camera.size_px, background_srgb));
+            return Ok(Picture::empty(camera.size_px, background_srgb, depth));
         };
-        learner.draw(&self.gpu, &extent.camera_in_units(camera), background_srgb, extent.radius_m, code)
+        learner.draw(&self.gpu, &extent.camera_in_units(camera), background_srgb, extent.radius_m, code, depth)
     }
 }
 
@@ -243,7 +246,8 @@ impl Renewable for NerfModel {
     fn begin_anew(&mut self) -> Result<(), Error> {
         self.settle()?;
         let compiled = self.compiled.take();
-        *self = Self { compiled, ..Self::new(self.gpu.clone(), self.options.clone())? };
+        let is_watched = self.is_watched;
+        *self = Self { compiled, is_watched, ..Self::new(self.gpu.clone(), self.options.clone())? };
         Ok(())
     }
 
@@ -338,7 +342,11 @@ impl Method for NerfModel {
         // Whoever looks must not decide with which keyframes the field begins.
         self.settle()?;
         let code = self.code_of(request.light_of.as_ref())?;
-        projections::render(request, |camera| self.draw(camera, request.background_srgb, code))
+        projections::render(request, |camera| self.draw(request, camera, code))
+    }
+
+    fn set_watched(&mut self, watched: bool) {
+        self.is_watched = watched;
     }
 
     fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {

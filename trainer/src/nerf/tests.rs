@@ -108,6 +108,8 @@ fn an_unseen_view_is_drawn_with_its_depth_and_twice_the_same() {
     let expected_m = (eye - AT.coords).norm() - 0.3;
     assert!((f64::from(picture.depth_m[middle]) - expected_m).abs() < 0.05, "{} m", picture.depth_m[middle]);
     assert!(picture.depth_m.iter().all(|depth| depth.is_finite()));
+    let without_depth = model.render(&RenderRequest { depth: false, ..request(unseen) }).unwrap();
+    assert!(without_depth.depth_m.is_empty() && without_depth.rgba_srgb == picture.rgba_srgb);
 
     // Somebody looks before all keyframes are there.
     let mut one_by_one = started(options(), &seen[..2]);

@@ -3,10 +3,9 @@
 mod header;
 mod packed;
 
-use crate::Error;
 use crate::splat::arrays::SplatArrays;
+use crate::{Error, whole_file};
 use header::{Column, Header, Table};
-use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
@@ -18,14 +17,11 @@ pub fn read(path: &Path) -> Result<SplatArrays, Error> {
 
 /// Writes a `.ply` of splats, little endian, f32; a broken disk leaves no file under this name that looks whole.
 pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
-    let partial = path.with_extension("ply.part");
-    let written = File::create(&partial).and_then(|file| {
+    whole_file::write(path, |file| {
         let mut file = BufWriter::new(file);
         write_to(&mut file, splats)?;
-        file.into_inner()?.sync_all()?;
-        std::fs::rename(&partial, path)
-    });
-    written.map_err(|source| Error::Write { path: path.to_owned(), source })
+        file.flush()
+    })
 }
 
 fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {

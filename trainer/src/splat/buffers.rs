@@ -4,7 +4,7 @@ use super::arrays::SplatArrays;
 use super::kernels::DrawPipelines;
 use super::params::{Capacity, Model, TILE_PX, status};
 use crate::Error;
-use crate::gpu::{Buffer, Gpu};
+use crate::gpu::{Buffer, Gpu, Passes};
 use crate::sort::SortBuffers;
 
 /// Splats of a block, neighbours in depth; bins a workgroup looks at; blocks of a group: as in shared/bins.wgsl.
@@ -73,15 +73,17 @@ impl SplatBuffers {
     pub(crate) fn reshaped(&self, gpu: &Gpu, capacity: u32, sh_degree: u32) -> Result<Self, Error> {
         let mut larger = Self::new(gpu, capacity, sh_degree)?;
         let (stride_from, stride_to) = (u64::from(self.capacity), u64::from(larger.capacity));
+        let mut copies = Passes::default();
         for ((from, n_planes, bytes), (to, n_planes_to, _)) in self.planes().iter().zip(larger.planes()) {
             for plane in 0..u64::from(*n_planes.min(&n_planes_to)) {
-                gpu.copy(
+                copies.copy(
                     (from, plane * stride_from * bytes),
                     (to, plane * stride_to * bytes),
                     u64::from(self.n_splats) * bytes,
                 );
             }
         }
+        copies.submit(gpu);
         larger.active_degree = self.active_degree.min(sh_degree);
         larger.set_n(gpu, self.n_splats);
         Ok(larger)
@@ -134,13 +136,17 @@ impl SplatBuffers {
         for channel in 0..3 {
             gpu.write(&self.sh_dc, 4 * (channel as u64 * stride + first), bytemuck::cast_slice(&plane(0, channel)));
         }
+        let mut zeros = Passes::default();
         for ix in 0..n_sh_rest(self.sh_degree) as usize {
             let at = 4 * (ix as u64 * stride + first);
             if 1 + ix / 3 < n_coeffs {
                 gpu.write(&self.sh_rest, at, bytemuck::cast_slice(&plane(1 + ix / 3, ix % 3)));
             } else {
-                gpu.clear(&self.sh_rest, at, 4 * n_new as u64);
+                zeros.clear_range(&self.sh_rest, at..at + 4 * n_new as u64);
             }
+        }
+        if !zeros.is_empty() {
+            zeros.submit(gpu);
         }
         let n_new = u32::try_from(n_new).expect("the caller has made room for u32 many");
         self.set_n(gpu, self.n_splats + n_new);

@@ -52,6 +52,7 @@ pub(super) fn request(world_from_camera: Transform) -> RenderRequest {
         crop: None,
         background_srgb: [0.0; 3],
         light_of: None,
+        depth: true,
     }
 }
 
@@ -159,6 +160,40 @@ fn learns_unseen_views_and_gives_the_same_bits_twice() {
     assert!(arrays.clone().checked().is_ok(), "a parameter is not finite");
     assert!(run(1).2 == arrays, "the same seed gave other bits");
     assert!(run(2).2 != arrays, "the seed has no effect: the comparison cannot fail");
+}
+
+/// On a software adapter images leave the GPU again: memory stays bounded however many keyframes there are.
+#[test]
+fn a_bound_on_images_holds_and_changes_no_bit() {
+    const LEVEL_0_BYTES: u64 = 8 * SIZE_PX[0] as u64 * SIZE_PX[1] as u64;
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = n_keyframes(&gpu, 20, true);
+    let n_train = keyframes.iter().filter(|keyframe| keyframe.split == Split::Train).count() as u64;
+    let run = |max_bytes: u64, train: fn(&mut SplatTrainer, u64)| {
+        let mut trainer = SplatTrainer::new(gpu.clone(), options()).unwrap();
+        trainer.hold_images(max_bytes);
+        for keyframe in &keyframes {
+            trainer.push(keyframe.clone()).unwrap();
+        }
+        train(&mut trainer, 130);
+        (trainer.image_bytes(), gpu.live_bytes(), trainer.arrays().unwrap())
+    };
+    let (image_bytes, live_bytes, arrays) = run(u64::MAX, train);
+    assert!(image_bytes >= n_train * LEVEL_0_BYTES && image_bytes < keyframes.len() as u64 * LEVEL_0_BYTES);
+    assert!(
+        image_bytes.is_multiple_of(LEVEL_0_BYTES),
+        "coarse images are gone once training has passed their resolution"
+    );
+
+    let max_bytes = 3 * LEVEL_0_BYTES;
+    let (bounded_bytes, bounded_live, bounded) = run(max_bytes, train_one_by_one);
+    assert!((1..=max_bytes).contains(&bounded_bytes), "{bounded_bytes} bytes of images");
+    assert_eq!(live_bytes - bounded_live, image_bytes - bounded_bytes, "images that left were freed");
+    assert!(bounded == arrays, "the bound changed what is learned");
+
+    // A submit of many steps needs more images at once than fit.
+    let (_, _, bounded) = run(max_bytes, train_in_long_submits);
+    assert!(bounded == arrays, "the bound changed what is learned in long submits");
 }
 
 #[test]
@@ -332,8 +367,13 @@ fn scratch_memory_grows_when_a_view_needs_more() {
     for keyframe in &keyframes[1..4] {
         trainer.push(Arc::new(Keyframe { depth: None, ..keyframe.as_ref().clone() })).unwrap();
     }
+    // Before there is any memory for it: what is read back is of the attempt that found room.
+    let large = RenderRequest { size_px: [640, 480], ..request(pose(0)) };
+    let [first, second] = [0, 1].map(|_| trainer.render(&large).unwrap());
+    assert!(first.rgba_srgb == second.rgba_srgb && first.depth_m == second.depth_m);
+    assert!(first.rgba_srgb.iter().any(|byte| *byte > 0));
     train(&mut trainer, 12);
-    let picture = trainer.render(&RenderRequest { size_px: [640, 480], ..request(pose(0)) }).unwrap();
+    let picture = trainer.render(&large).unwrap();
     assert!(picture.rgba_srgb.iter().any(|byte| *byte > 0));
     assert_eq!(trainer.progress().step, 12);
 }
@@ -346,6 +386,13 @@ fn all_directions_agree_with_the_pinhole_view() {
         .render(&RenderRequest { size_px: [512, 256], projection: Projection::Equirectangular, ..request(pose(2)) })
         .unwrap();
     let ahead = trainer.render(&request(pose(2))).unwrap();
+    for projection in [Projection::Equirectangular, request(pose(2)).projection] {
+        let with_depth = RenderRequest { projection, ..request(pose(2)) };
+        let [with, without] =
+            [true, false].map(|depth| trainer.render(&RenderRequest { depth, ..with_depth.clone() }).unwrap());
+        assert!(with.rgba_srgb == without.rgba_srgb);
+        assert_eq!((with.depth_m.len(), without.depth_m.len()), ((SIZE_PX[0] * SIZE_PX[1]) as usize, 0));
+    }
     let middle = |picture: &crate::Picture| {
         let at = ((picture.size_px[1] / 2) * picture.size_px[0] + picture.size_px[0] / 2) as usize;
         (picture.rgba_srgb[4 * at], picture.depth_m[at])
@@ -375,6 +422,33 @@ fn the_length_of_submits_changes_no_bit() {
         (trainer.arrays().unwrap(), trainer.camera_fixes().unwrap())
     };
     assert!(learned(train_in_long_submits) == learned(train_one_by_one));
+}
+
+/// Nor does anybody who looks: submits are shorter then, and images come to the GPU in smaller batches.
+#[test]
+fn submits_are_short_while_somebody_looks_and_no_bit_differs() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = keyframes(&gpu, true);
+    let learned = |watched: bool| {
+        let mut trainer = SplatTrainer::new(gpu.clone(), options()).unwrap();
+        for keyframe in &keyframes {
+            trainer.push(keyframe.clone()).unwrap();
+        }
+        train(&mut trainer, 100);
+        trainer.set_watched(watched);
+        for _ in 0..2 {
+            trainer.assume_step_millis(1.0);
+            assert_eq!(trainer.step(100).unwrap(), if watched { 4 } else { 20 });
+            if watched {
+                let seen = RenderRequest { depth: false, ..request(keyframes[0].world_from_camera) };
+                assert!(trainer.render(&seen).unwrap().depth_m.is_empty());
+            }
+        }
+        let left = 160 - trainer.progress().step;
+        train(&mut trainer, left);
+        trainer.arrays().unwrap()
+    };
+    assert!(learned(true) == learned(false));
 }
 
 /// Nor where a trial ends, and held-back images join in.

@@ -25,6 +25,8 @@ pub mod reference;
 mod resuming;
 mod seed;
 mod trainer;
+#[cfg(test)]
+mod trial_tests;
 mod trials;
 mod views;
 

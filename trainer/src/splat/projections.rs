@@ -10,7 +10,7 @@ use kinematics::Transform;
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 use std::f64::consts::{FRAC_PI_2, PI};
 
-/// Draws what is asked for with `draw`, which knows pinhole cameras.
+/// Draws what is asked for with `draw`, which knows pinhole cameras and gives their pictures depth where the request wants it.
 pub(crate) fn render(
     request: &RenderRequest,
     mut draw: impl FnMut(&Camera) -> Result<Picture, Error>,
@@ -54,8 +54,11 @@ fn all_directions(
     ];
     let faces: Vec<Picture> = turns.iter().map(|turn| draw(&face(*turn))).collect::<Result<_, _>>()?;
     let n = (width * height) as usize;
-    let mut picture =
-        Picture { size_px: request.size_px, rgba_srgb: Vec::with_capacity(4 * n), depth_m: Vec::with_capacity(n) };
+    let mut picture = Picture {
+        size_px: request.size_px,
+        rgba_srgb: Vec::with_capacity(4 * n),
+        depth_m: Vec::with_capacity(if request.depth { n } else { 0 }),
+    };
     for y in 0..height {
         let latitude = FRAC_PI_2 - PI * (f64::from(y) + 0.5) / f64::from(height);
         for x in 0..width {
@@ -75,7 +78,9 @@ fn all_directions(
             let at = (pixel(1) * edge + pixel(0)) as usize;
             let seen = &faces[face_ix];
             picture.rgba_srgb.extend_from_slice(&seen.rgba_srgb[4 * at..4 * at + 4]);
-            picture.depth_m.push(seen.depth_m[at] / crate::gpu::f32_of(in_face.z));
+            if request.depth {
+                picture.depth_m.push(seen.depth_m[at] / crate::gpu::f32_of(in_face.z));
+            }
         }
     }
     Ok(picture)

@@ -26,7 +26,7 @@ const RANDOM_OPACITY: f64 = 0.1;
 const SH_0: f64 = 0.282_094_791_773_878_14;
 
 /// Remembers which places have been given splats.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub(crate) struct Seeder {
     /// Octave of the spacing, and the cell of that size.
     taken: HashSet<(i32, [i32; 3])>,

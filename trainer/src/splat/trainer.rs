@@ -14,12 +14,13 @@ use super::options::SplatOptions;
 use super::params::{Camera, Growth, Rule, Supervision, View, status};
 use super::passes::{self, GrowthBuffers, Target, ViewPasses};
 use super::seed::{self, Density, Seeder};
-use super::trials::{CameraChoice, Candidate, Due, HeldBack, Now, Trial, Trials};
-use super::views::{Level, LevelImages, Order, TrainView};
+use super::trials::{CameraChoice, Candidate, Due, Ended, HeldBack, Now, Trial, Trials, Turned};
+use super::views::{self, Keep, Level, LevelImages, Order, TrainView};
 use crate::align::{Aligning, Alignment};
 use crate::checkpoint::PendingCheckpoint;
-use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
-use crate::{Error, Keyframe, Method, Part, Picture, Progress, RenderRequest, Split, ply};
+use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, Pipeline, f32_of};
+use crate::method::submit_millis;
+use crate::{Error, Keyframe, Method, Part, Picture, Progress, Projection, RenderRequest, Split, ply};
 use kinematics::Stamp;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
@@ -35,10 +36,14 @@ const GROWTH_START: u64 = 200;
 const GROWTH_END_FRAC: f64 = 0.75;
 /// Steps between degrees of spherical harmonics.
 const SH_PERIOD: u64 = 300;
-/// GPU time a submit may hold, so that pictures and Ctrl-C get their turn.
-const SUBMIT_MILLIS: f64 = 20.0;
 /// Most steps of a submit.
 const MAX_STEPS_PER_SUBMIT: u64 = 64;
+/// Most bytes of images that a software adapter holds: its memory is the host's, which holds all keyframes already.
+const SOFTWARE_IMAGE_BYTES: u64 = 256 << 20;
+/// Images that are made at once where all views are looked at in turn.
+const VIEWS_AT_ONCE: usize = 16;
+/// Views whose images are made and uploaded at once while pictures are asked for: with more of them a picture waits too long.
+const VIEWS_AT_ONCE_WATCHED: u64 = 4;
 /// Readings further than this from the rendered depth are outliers.
 const DEPTH_CLIP_M: f64 = 0.2;
 
@@ -82,6 +87,10 @@ pub struct SplatTrainer {
     seeds_per_image: f64,
     coarse_steps: [u64; 2],
     views: Vec<TrainView>,
+    /// Most bytes of their images on the GPU, unless a submit needs more.
+    max_image_bytes: u64,
+    /// How often images were asked for.
+    images_asked: u64,
     order: Order,
     scene_size_m: f64,
     has_depth: bool,
@@ -91,10 +100,29 @@ pub struct SplatTrainer {
     /// Step from which the planned steps count: late keyframes set it forward.
     schedule_start: u64,
     grown_at: u64,
+    /// Whether the GPU had no memory for more splats.
+    is_full: bool,
     n_poisoned: u64,
     in_flight: Option<InFlight>,
     idle_since: Instant,
     step_millis: f64,
+    /// Whether pictures are asked for.
+    is_watched: bool,
+    /// The image that a picture was last compared with, to be used again.
+    compared: Option<Buffer>,
+}
+
+/// What of a picture is read back.
+#[derive(Clone, Copy, Debug)]
+enum Wanted<'a> {
+    Nothing,
+    Color,
+    ColorAndDepth,
+    /// How it compares with an image: the sums of `score.wgsl`.
+    Comparison {
+        score: &'a Pipeline,
+        image: &'a Buffer,
+    },
 }
 
 #[derive(Debug)]
@@ -127,13 +155,23 @@ impl Drop for Compiling {
     }
 }
 
-/// All that learning changes, to go back to.
+/// All that learning changes, to restore it later. No keyframe waits for its splats when a state is taken.
 #[derive(Debug)]
 pub(crate) struct State {
     pub(super) splats: SplatBuffers,
     pub(super) cameras: (TermSet, Buffer),
     pub(super) step: u64,
     pub(super) grown_at: u64,
+    pub(super) seeding: Seeding,
+}
+
+/// What keyframes change when they arrive: places that have splats, and the scale and schedule of learning.
+#[derive(Clone, Debug)]
+pub(crate) struct Seeding {
+    pub(super) seeder: Seeder,
+    pub(super) scene_size_m: f64,
+    pub(super) has_depth: bool,
+    pub(super) schedule_start: u64,
 }
 
 /// What a step touches of the view it learns from.
@@ -204,6 +242,8 @@ impl SplatTrainer {
                 .min(f64::from(options.cap()) * SEED_SHARE),
             coarse_steps: options.coarse_steps.unwrap_or(if software { [500, 4000] } else { [150, 400] }),
             views: Vec::new(),
+            max_image_bytes: if software { SOFTWARE_IMAGE_BYTES } else { u64::MAX },
+            images_asked: 0,
             order: Order::new(options.seed),
             scene_size_m: 1.0,
             has_depth: false,
@@ -211,10 +251,13 @@ impl SplatTrainer {
             n_taken_back: 0,
             schedule_start: 0,
             grown_at: 0,
+            is_full: false,
             n_poisoned: 0,
             in_flight: None,
             idle_since: Instant::now(),
             step_millis: 0.0,
+            is_watched: false,
+            compared: None,
             gpu,
             options,
         })
@@ -270,9 +313,31 @@ impl SplatTrainer {
         self.step_millis = millis;
     }
 
+    /// Bounds the images on the GPU as on a software adapter.
+    #[cfg(test)]
+    pub(super) fn hold_images(&mut self, max_bytes: u64) {
+        self.max_image_bytes = max_bytes;
+    }
+
+    #[cfg(test)]
+    pub(super) fn image_bytes(&self) -> u64 {
+        self.views.iter().map(TrainView::image_bytes).sum()
+    }
+
     #[cfg(test)]
     pub(super) fn n_steps_on_gpu(&self) -> u64 {
         self.gpu.read::<u32>(&self.learn_status, status::LEN).unwrap()[status::STEP].into()
+    }
+
+    /// Places that count as seeded.
+    #[cfg(test)]
+    pub(super) fn n_seeds(&self) -> usize {
+        self.seeder.n_seeds()
+    }
+
+    #[cfg(test)]
+    pub(super) fn times_learned_from(&self, keyframe: &Keyframe) -> usize {
+        self.views.iter().filter(|view| view.keyframe.stamp == keyframe.stamp).count()
     }
 
     /// Gradients that were not finite and were dropped.
@@ -300,17 +365,43 @@ impl SplatTrainer {
             return Ok(());
         }
         let n_after = self.splats.n_splats + u32::try_from(n_new).expect("the cap is a u32");
-        self.make_room(n_after)?;
+        let n_new = (self.room_for(n_after)? - self.splats.n_splats) as usize;
+        if n_new == 0 {
+            return Ok(());
+        }
         let kept = if n_new == arrays.n_splats() { arrays.clone() } else { spread_out(arrays, n_new) };
         self.splats.append(&self.gpu, &kept);
         self.tell_n();
         Ok(())
     }
 
+    /// Makes room for so many splats; where the GPU has no memory for them, says how many there is room for.
+    fn room_for(&mut self, n_splats: u32) -> Result<u32, Error> {
+        if self.is_full {
+            return Ok(n_splats.min(self.splats.capacity));
+        }
+        match self.make_room(n_splats) {
+            Ok(()) => Ok(n_splats),
+            Err(error) if error.is_of_memory() && self.splats.n_splats > 0 => {
+                self.is_full = true;
+                log::warn!("the model stops growing at {} splats: {error}", self.splats.n_splats);
+                Ok(n_splats.min(self.splats.capacity))
+            }
+            Err(error) => Err(error),
+        }
+    }
+
     fn make_room(&mut self, n_splats: u32) -> Result<(), Error> {
         if n_splats > self.splats.capacity {
             let capacity =
                 n_splats.max(self.splats.capacity.saturating_mul(3) / 2).min(self.options.cap().max(n_splats));
+            // Before the model itself: it must be possible to draw whatever there is room for.
+            let have = self.scratch.as_ref().map(|(size, _)| *size);
+            if let Some(have) = have {
+                let n_entries = have.n_entries.max(2 * capacity);
+                let n_slots = if have.n_slots > 0 { have.n_slots.max(4 * capacity) } else { 0 };
+                self.ensure_scratch(ScratchSize { n_splats: capacity, n_entries, n_slots, ..have })?;
+            }
             self.splats = self.splats.reshaped(&self.gpu, capacity, self.splats.sh_degree)?;
             self.passes.forget_bindings();
         }
@@ -416,17 +507,15 @@ impl SplatTrainer {
         self.gpu.write(&self.rule, 0, bytemuck::bytes_of(&rule));
     }
 
-    /// Makes what the next `n` steps look at and was not looked at before, on all processors.
+    /// Uploads the images that the next `n` steps need and the GPU does not hold.
     fn prepare_levels(&mut self, n: u64) -> Result<(), Error> {
         let mut wanted = self.looked_at(n);
-        if wanted.iter().all(|(view_ix, level)| self.views[*view_ix].has_level(*level)) {
-            return Ok(());
-        }
-        if !self.gpu.is_software() {
+        let all_there = wanted.iter().all(|(view_ix, level)| self.views[*view_ix].has_level(*level));
+        if !all_there && !self.gpu.is_software() {
             // Enough at once for all processors, and for the time of a step not to be that of its images.
-            wanted = self.looked_at(n.max(MAX_STEPS_PER_SUBMIT));
+            wanted = self.looked_at(n.max(if self.is_watched { VIEWS_AT_ONCE_WATCHED } else { MAX_STEPS_PER_SUBMIT }));
         }
-        self.make_levels(wanted)
+        self.make_levels(&wanted)
     }
 
     /// The views and levels of the next `n` steps.
@@ -439,16 +528,37 @@ impl SplatTrainer {
         looked_at
     }
 
-    /// Makes what is not there yet of these views and levels, on all processors.
-    fn make_levels(&mut self, wanted: BTreeSet<(usize, usize)>) -> Result<(), Error> {
-        let wanted: Vec<(usize, usize)> =
-            wanted.into_iter().filter(|(view_ix, level)| !self.views[*view_ix].has_level(*level)).collect();
-        let made: Vec<LevelImages> = wanted
-            .par_iter()
-            .map(|(view_ix, level)| LevelImages::new(&self.views[*view_ix].keyframe, *level))
-            .collect();
-        for ((view_ix, level), images) in wanted.into_iter().zip(&made) {
-            self.views[view_ix].upload(&self.gpu, level, images)?;
+    /// Uploads these levels of views where the GPU does not hold them, made on all processors; others may have to make room.
+    fn make_levels(&mut self, wanted: &BTreeSet<(usize, usize)>) -> Result<(), Error> {
+        let missing: Vec<(usize, usize)> =
+            wanted.iter().copied().filter(|(view_ix, level)| !self.views[*view_ix].has_level(*level)).collect();
+        if !missing.is_empty() {
+            let made: Vec<LevelImages> = missing
+                .par_iter()
+                .map(|(view_ix, level)| LevelImages::new(&self.views[*view_ix].keyframe, *level))
+                .collect();
+            let new_bytes = made.iter().map(LevelImages::bytes).sum();
+            let keep = Keep {
+                needed: wanted,
+                coarsest: level_at(self.step, self.coarse_steps),
+                max_bytes: self.max_image_bytes.saturating_sub(new_bytes),
+            };
+            let mut dropped = views::drop_levels(&mut self.views, keep);
+            if !dropped.is_empty() && !self.passes.is_empty() {
+                self.passes.submit(&self.gpu); // What is listed needs the images that are replaced.
+            }
+            for ((view_ix, level), images) in missing.into_iter().zip(&made) {
+                let same_size = dropped.iter().position(|level| level.size_px == images.size_px());
+                let reused = same_size.map(|ix| dropped.swap_remove(ix));
+                self.views[view_ix].upload(&self.gpu, level, images, reused)?;
+            }
+            if !dropped.is_empty() {
+                self.passes.forget_bindings();
+            }
+        }
+        self.images_asked += 1;
+        for (view_ix, level) in wanted {
+            self.views[*view_ix].touch(*level, self.images_asked);
         }
         Ok(())
     }
@@ -487,10 +597,19 @@ impl SplatTrainer {
 
     /// Makes all that a view needs to be learned from, `2^level` times smaller or as small as it gets; says how small.
     fn make_ready(&mut self, view_ix: usize, level: u32) -> Result<usize, Error> {
-        let size_px = self.views[view_ix].level(&self.gpu, level)?.size_px;
+        let level_ix = self.views[view_ix].clamped(level);
+        if !self.views[view_ix].has_level(level_ix) {
+            self.make_levels(&BTreeSet::from([(view_ix, level_ix)]))?;
+        }
+        self.make_space(view_ix, level_ix)?;
+        Ok(level_ix)
+    }
+
+    /// Makes the buffers that learning from a view at a level needs, without its images.
+    fn make_space(&mut self, view_ix: usize, level_ix: usize) -> Result<(), Error> {
+        let size_px = self.views[view_ix].size_at(level_ix);
         self.make_scratch(size_px, true)?;
-        ensure_frame(&self.gpu, &mut self.learn_frame, &mut self.passes, size_px, true)?;
-        Ok(self.views[view_ix].clamped(level))
+        ensure_frame(&self.gpu, &mut self.learn_frame, &mut self.passes, size_px, true)
     }
 
     /// A view and level that are ready, with its camera as it is learned now; lists what that takes.
@@ -548,8 +667,14 @@ impl SplatTrainer {
         };
         self.passes.submit(&self.gpu); // What is listed holds the old buffers.
         self.passes.forget_bindings();
-        self.scratch = None;
-        self.scratch = Some((size, Scratch::new(&self.gpu, &self.draw, size)?));
+        let had = self.scratch.take().map(|(size, _)| size);
+        let made = Scratch::new(&self.gpu, &self.draw, size);
+        if made.is_err()
+            && let Some(had) = had
+        {
+            self.scratch = Some((had, Scratch::new(&self.gpu, &self.draw, had)?));
+        }
+        self.scratch = Some((size, made?));
         Ok(())
     }
 
@@ -617,10 +742,13 @@ impl SplatTrainer {
         }
         self.grown_at = self.step;
         let n_before = self.splats.n_splats;
-        let more =
-            if self.trials.may_grow() { (f64::from(n_before) * self.options.growth_frac).ceil() as u32 } else { 0 };
+        let more = if self.trials.may_grow() && !self.is_full {
+            (f64::from(n_before) * self.options.growth_frac).ceil() as u32
+        } else {
+            0
+        };
         let n_after = (n_before + more).min(self.options.cap()).max(n_before);
-        self.make_room(n_after)?;
+        let n_after = self.room_for(n_after)?.max(n_before);
         let growth = Growth {
             n_before,
             n_after,
@@ -631,14 +759,14 @@ impl SplatTrainer {
             least_opacity: 0.005,
             unused: 0.0,
         };
-        let words = |name: &str, n: u32| self.gpu.storage(name, 4 * u64::from(n));
-        let buffers = GrowthBuffers {
-            growth: self.gpu.uniform_with("splat.growth", &growth),
-            weights: words("splat.weights", n_before)?,
-            cumulative: words("splat.cumulative", n_before)?,
-            block_weights: words("splat.block_weights", n_before.div_ceil(256))?,
-            n_children: words("splat.n_children", n_before)?,
-            parents: words("splat.parents", n_after)?,
+        let buffers = match self.growth_buffers(&growth) {
+            Err(error) if error.is_of_memory() => {
+                if !std::mem::replace(&mut self.is_full, true) {
+                    log::warn!("the model stops growing at {n_before} splats: {error}");
+                }
+                return Ok(());
+            }
+            buffers => buffers?,
         };
         passes::grow(&self.gpu, &mut self.passes, learn, &self.splats, &buffers, &growth);
         self.passes.submit(&self.gpu);
@@ -648,12 +776,30 @@ impl SplatTrainer {
         Ok(())
     }
 
+    fn growth_buffers(&self, growth: &Growth) -> Result<GrowthBuffers, Error> {
+        let words = |name: &str, n: u32| self.gpu.storage(name, 4 * u64::from(n));
+        Ok(GrowthBuffers {
+            growth: self.gpu.uniform_with("splat.growth", growth),
+            weights: words("splat.weights", growth.n_before)?,
+            cumulative: words("splat.cumulative", growth.n_before)?,
+            block_weights: words("splat.block_weights", growth.n_before.div_ceil(256))?,
+            n_children: words("splat.n_children", growth.n_before)?,
+            parents: words("splat.parents", growth.n_after)?,
+        })
+    }
+
     fn state(&self) -> Result<State, Error> {
         Ok(State {
             splats: self.splats.reshaped(&self.gpu, self.splats.capacity, self.splats.sh_degree)?,
             cameras: (self.cameras.set, self.cameras.copy(&self.gpu)?),
             step: self.step,
             grown_at: self.grown_at,
+            seeding: Seeding {
+                seeder: self.seeder.clone(),
+                scene_size_m: self.scene_size_m,
+                has_depth: self.has_depth,
+                schedule_start: self.schedule_start,
+            },
         })
     }
 
@@ -662,6 +808,9 @@ impl SplatTrainer {
         self.n_taken_back = self.n_taken_back.wrapping_add(self.step).wrapping_sub(state.step);
         (self.splats, self.step, self.grown_at) = (state.splats, state.step, state.grown_at);
         self.cameras.go_back(&self.gpu, state.cameras)?;
+        let Seeding { seeder, scene_size_m, has_depth, schedule_start } = state.seeding;
+        (self.seeder, self.scene_size_m, self.has_depth) = (seeder, scene_size_m, has_depth);
+        self.schedule_start = schedule_start;
         self.tell_n();
         let step = u32::try_from(self.step).unwrap_or(u32::MAX);
         self.gpu.write(&self.learn_status, 4 * status::STEP as u64, bytemuck::bytes_of(&step));
@@ -684,41 +833,79 @@ impl SplatTrainer {
             self.settle()?; // Steps may turn out to be lost.
             match self.trials.due(self.now()) {
                 Due::Nothing => {}
-                Due::Begin(candidate) => {
-                    let state = self.state()?;
-                    self.trials.begin(candidate, state, self.views.len());
-                }
+                Due::Begin(candidate) => match self.state() {
+                    Ok(state) => self.trials.begin(candidate, state, self.views.len()),
+                    Err(error) => self.end_trials_without_memory(error)?,
+                },
                 Due::Turn => self.turn_trial()?,
+                Due::Arrival => {
+                    if let Some(keyframe) = self.trials.next_arrival() {
+                        self.welcome(keyframe)?;
+                        self.begin_learning()?;
+                    }
+                }
                 Due::Gains => self.try_gains()?,
                 Due::End => {
                     let with_db = self.score_held_back()?;
-                    if let Some(instead) = self.trials.end(&with_db) {
-                        self.go_back(instead)?;
+                    if let Some(ended) = self.trials.end(&with_db) {
+                        self.end_trial(ended)?;
+                        self.begin_learning()?;
                     }
                 }
-                Due::Join => {
-                    for keyframe in self.trials.settle() {
-                        self.learn_from(keyframe)?;
-                    }
-                    self.begin_learning()?;
-                }
+                Due::Join => self.join_held_back()?,
             }
         }
         Ok(())
     }
 
+    fn join_held_back(&mut self) -> Result<(), Error> {
+        for keyframe in self.trials.settle() {
+            self.learn_from(keyframe)?;
+        }
+        self.begin_learning()
+    }
+
+    /// A trial takes copies of the model; where there is no memory for them the model learns as it is.
+    fn end_trials_without_memory(&mut self, error: Error) -> Result<(), Error> {
+        if !error.is_of_memory() {
+            return Err(error);
+        }
+        log::warn!("no more changes of the model are tried: {error}");
+        self.join_held_back()
+    }
+
     /// Goes back to where a trial began, with the change.
     fn turn_trial(&mut self) -> Result<(), Error> {
         let without_db = self.score_held_back()?;
-        let state = self.state()?;
-        let Some((from, candidate)) = self.trials.turn(state, without_db) else { return Ok(()) };
+        let state = match self.state() {
+            Ok(state) => state,
+            Err(error) => return self.end_trials_without_memory(error),
+        };
+        let Some(Turned { from, candidate, arrived }) = self.trials.turn(state, without_db) else { return Ok(()) };
         self.go_back(from)?;
+        self.views.retain(|view| !arrived.iter().any(|keyframe| Arc::ptr_eq(keyframe, &view.keyframe)));
         match candidate {
             Candidate::Cameras(terms) => self.cameras.learn_also(terms),
             Candidate::Halved { to, .. } => self.keep_most(to)?,
             Candidate::ShDegree { to, .. } => self.lower_degree(to)?,
         }
         self.begin_learning()
+    }
+
+    /// Restores the state without the change where the change is rejected, then learns from what arrived meanwhile.
+    fn end_trial(&mut self, Ended { restored, seeded, deferred }: Ended) -> Result<(), Error> {
+        if let Some(state) = restored {
+            self.go_back(state)?;
+            self.views.extend(seeded.into_iter().map(TrainView::new));
+        }
+        deferred.into_iter().try_for_each(|keyframe| self.welcome(keyframe))
+    }
+
+    /// Learns from a keyframe that arrives now.
+    fn welcome(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
+        // What comes late finds at least half of the plan ahead of it: rates that still move things, and growth.
+        self.schedule_start = self.schedule_start.max(self.step.saturating_sub(self.options.n_planned_steps / 2));
+        self.learn_from(keyframe)
     }
 
     fn learn_from(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
@@ -735,17 +922,26 @@ impl SplatTrainer {
     }
 
     /// Draws one pinhole view.
-    fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3]) -> Result<Picture, Error> {
-        self.draw_into_frame(camera, background_srgb, true)?;
-        let Some(frame) = &self.draw_frame else { return Err(Error::DeviceLost) };
-        let n = (camera.size_px[0] * camera.size_px[1]) as usize;
-        let pixels: Vec<u32> = self.gpu.read(&frame.pixels, n)?;
-        let depth_m = self.gpu.read(&frame.depths, n)?;
-        Ok(Picture { size_px: camera.size_px, rgba_srgb: bytemuck::cast_slice(&pixels).to_vec(), depth_m })
+    fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3], depth: bool) -> Result<Picture, Error> {
+        let wanted = if depth { Wanted::ColorAndDepth } else { Wanted::Color };
+        self.draw_reading(camera, background_srgb, true, wanted, |parts| Picture::of_parts(camera.size_px, parts))
     }
 
     /// Draws one pinhole view into the frame for pictures, of the splats that people see or of those that learn.
     fn draw_into_frame(&mut self, camera: &Camera, background_srgb: [f32; 3], shown: bool) -> Result<(), Error> {
+        self.draw_reading(camera, background_srgb, shown, Wanted::Nothing, |_| ())
+    }
+
+    /// Draws one pinhole view into the frame for pictures and passes the bytes of what is wanted of it to `take`. Counters,
+    /// which say whether all intersections found room, come back in the same read; where they did not, it is drawn again.
+    fn draw_reading<R>(
+        &mut self,
+        camera: &Camera,
+        background_srgb: [f32; 3],
+        shown: bool,
+        wanted: Wanted<'_>,
+        take: impl Fn(&[&[u8]]) -> R,
+    ) -> Result<R, Error> {
         let size_px = camera.size_px;
         self.gpu.write(&self.draw_view, 0, bytemuck::bytes_of(&camera.view()));
         let [red, green, blue] = background_srgb;
@@ -764,11 +960,28 @@ impl SplatTrainer {
             let passes = ViewPasses { gpu, splats, scratch, frame, status, view, size_px };
             passes.draw(&mut list, &self.draw);
             passes.finish(&mut list, &self.draw, &self.plain);
-            list.submit(&self.gpu);
+            let mut read = vec![(status, 4 * status::LEN)];
+            match wanted {
+                Wanted::Nothing => {}
+                Wanted::Color => read.extend(Picture::buffers(size_px, &frame.pixels, None)),
+                Wanted::ColorAndDepth => read.extend(Picture::buffers(size_px, &frame.pixels, Some(&frame.depths))),
+                Wanted::Comparison { score, image } => {
+                    let n_groups = scoring::compare(gpu, &mut list, score, (view, frame), size_px, image);
+                    read.push((&frame.products, scoring::PRODUCTS_BYTES * n_groups as usize));
+                }
+            }
+            let read = list.submit_reading(&self.gpu, &read);
             self.passes = list;
-            let counters: Vec<u32> = self.gpu.read(&self.draw_status, status::LEN)?;
+            let (counters, taken) = read.finish_with(&self.gpu, |parts| {
+                let counters: Vec<u32> = bytemuck::pod_collect_to_vec(parts[0]);
+                let taken = (counters[status::FAILED] == 0).then(|| take(&parts[1..]));
+                (counters, taken)
+            })?;
+            if let Some(taken) = taken {
+                return Ok(taken);
+            }
             if !self.mend(&counters)? {
-                return Ok(());
+                return Err(Error::DeviceLost);
             }
             self.gpu.write(&self.draw_status, 4 * status::FAILED as u64, &[0; 12]);
         }
@@ -794,15 +1007,20 @@ impl Method for SplatTrainer {
             self.trials.held_back.push(HeldBack { keyframe, image: None });
             return Ok(());
         }
-        // What comes late finds at least half of the plan ahead of it: rates that still move things, and growth.
-        self.schedule_start = self.schedule_start.max(self.step.saturating_sub(self.options.n_planned_steps / 2));
-        self.learn_from(keyframe)
+        // Both halves of a trial learn from the same keyframes at the same steps.
+        if self.trials.defers(&keyframe, self.step) {
+            return Ok(());
+        }
+        self.welcome(keyframe)
     }
 
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
         self.settle()?; // The step at which it goes must be true.
         self.views.retain(|view| view.keyframe.camera.as_ref() != camera || view.keyframe.stamp != stamp);
-        self.trials.remove(|keyframe| keyframe.camera.as_ref() == camera && keyframe.stamp == stamp);
+        let is_it = |keyframe: &Keyframe| keyframe.camera.as_ref() == camera && keyframe.stamp == stamp;
+        self.trials.remove(is_it);
+        self.pending.retain(|keyframe| !is_it(keyframe));
+        self.unseeded.retain(|keyframe| !is_it(keyframe));
         self.passes.forget_bindings();
         Ok(())
     }
@@ -819,7 +1037,8 @@ impl Method for SplatTrainer {
         self.align_when_due()?;
         self.try_when_due()?;
         self.grow_when_due(&learn)?;
-        let by_time = if self.step_millis > 0.0 { (SUBMIT_MILLIS / self.step_millis) as u64 } else { 1 };
+        let most_millis = submit_millis(self.is_watched);
+        let by_time = if self.step_millis > 0.0 { (most_millis / self.step_millis) as u64 } else { 1 };
         let to_change = GROWTH_PERIOD - self.step % GROWTH_PERIOD; // Growth and degrees change at multiples of it.
         let asked = n;
         let n = n
@@ -834,8 +1053,7 @@ impl Method for SplatTrainer {
         for step in self.step..self.step + n {
             self.record_step(&learn, step)?;
         }
-        self.passes.submit(&self.gpu);
-        let status = self.gpu.begin_read(&self.learn_status, status::LEN);
+        let status = self.passes.submit_reading(&self.gpu, &[(&self.learn_status, 4 * status::LEN)]);
         self.step += n;
         let failed = self.settle()?; // The submit before; this one runs meanwhile.
         if !failed {
@@ -881,7 +1099,17 @@ impl Method for SplatTrainer {
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         self.seed_from_depth()?;
-        super::projections::render(request, |camera| self.draw_view(camera, request.background_srgb))
+        super::projections::render(request, |camera| self.draw_view(camera, request.background_srgb, request.depth))
+    }
+
+    fn set_watched(&mut self, watched: bool) {
+        self.is_watched = watched;
+    }
+
+    fn psnr(&mut self, request: &RenderRequest, keyframe: &Keyframe) -> Result<Option<f64>, Error> {
+        self.seed_from_depth()?;
+        let Projection::Pinhole { focal_px, principal_px } = request.projection else { return Ok(None) };
+        self.psnr_of_view(&Camera::of_request(request, focal_px, principal_px), request.background_srgb, keyframe)
     }
 
     fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {
@@ -908,9 +1136,9 @@ impl Method for SplatTrainer {
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {
         self.settle()?;
-        if let Some(instead) = self.trials.give_up() {
+        if let Some(ended) = self.trials.give_up() {
             log::info!("training ends before what is being tried could be judged: saved without it");
-            self.go_back(instead)?;
+            self.end_trial(ended)?;
         }
         let arrays = self.arrays()?;
         std::fs::create_dir_all(folder).map_err(|source| Error::Write { path: folder.to_owned(), source })?;

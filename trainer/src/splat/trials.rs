@@ -1,7 +1,8 @@
 //! Whether a part of the model pays: tried on a copy of the model, judged by images not learned from.
 //!
 //! At the start the selection keyframes are held back. Each candidate gets as many steps as the model without it, from
-//! the same state. What is added stays when the paired gain on the selection keyframes exceeds both a least gain and two
+//! the same state. Keyframes that arrive meanwhile reach both at the same step, or wait until the trial has ended.
+//! What is added stays when the paired gain on the selection keyframes exceeds both a least gain and two
 //! standard errors; what is left out stays out when that costs less than a least gain, half a standard error counted in,
 //! and all of it together no more than [`MOST_SPENT_DB`]. When all is settled the selection keyframes are learned from, too.
 
@@ -10,8 +11,9 @@ use super::trainer::State;
 use crate::gain::{Gain, LEAST_GAIN_DB};
 use crate::gpu::Buffer;
 use crate::{Keyframe, Part};
+use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
 /// Step of the first trial: earlier the scene is too rough to tell.
@@ -27,6 +29,8 @@ const LEAST_GAIN_OF_DOUBLING_DB: f64 = 0.1;
 const MOST_SPENT_DB: f64 = 0.15;
 /// Fewer selection keyframes tell nothing.
 const LEAST_IMAGES: usize = 4;
+/// Most selection keyframes that a score is the mean over.
+pub(crate) const MAX_SCORED: usize = 24;
 /// Fewer splats are not divided further.
 const FEWEST_SPLATS: u32 = 1000;
 
@@ -174,6 +178,28 @@ pub(crate) struct HeldBack {
     pub(crate) image: Option<Buffer>,
 }
 
+/// Camera and stamp of a keyframe.
+pub(crate) type ImageId = (Arc<str>, Stamp);
+
+/// PSNR of selection keyframes, dB.
+pub(crate) type Scores = BTreeMap<ImageId, f64>;
+
+fn id_of(keyframe: &Keyframe) -> ImageId {
+    (keyframe.camera.clone(), keyframe.stamp)
+}
+
+/// Scores of the images that both hold.
+fn paired(without_db: &Scores, with_db: &Scores) -> (Vec<f64>, Vec<f64>) {
+    without_db.iter().filter_map(|(id, without)| Some((*without, *with_db.get(id)?))).unzip()
+}
+
+/// A training keyframe that arrived during a trial, and the step at which it did.
+#[derive(Clone, Debug)]
+pub(crate) struct Arrival {
+    pub(crate) step: u64,
+    pub(crate) keyframe: Arc<Keyframe>,
+}
+
 /// Whether the number of splats is settled.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Count {
@@ -202,10 +228,52 @@ pub(crate) struct Trials {
 #[derive(Debug)]
 enum Phase {
     Waiting,
-    Without { candidate: Candidate, from: Box<State>, until: u64 },
-    With { candidate: Candidate, instead: Box<State>, without_db: Vec<f64>, until: u64 },
+    Without(Running),
+    With {
+        trial: Running,
+        without_db: Scores,
+        /// Keyframes that wait for the end of the trial.
+        deferred: Vec<Arc<Keyframe>>,
+    },
     Settled,
 }
+
+/// A trial under way.
+#[derive(Debug)]
+pub(crate) struct Running {
+    pub(crate) candidate: Candidate,
+    /// Last step of this half.
+    pub(crate) until: u64,
+    /// The state that does not learn now: where the trial began in the first half, the end of the first half in the second.
+    pub(crate) other: Box<State>,
+    /// The selection keyframes that both halves are scored on.
+    pub(crate) scored: Vec<ImageId>,
+    /// In the first half keyframes that arrived; in the second those that have yet to arrive again.
+    pub(crate) arrivals: VecDeque<Arrival>,
+}
+
+/// The second half of a trial begins.
+pub(crate) struct Turned {
+    /// The state to restore.
+    pub(crate) from: State,
+    /// What to change there.
+    pub(crate) candidate: Candidate,
+    /// Keyframes to forget: they arrive again.
+    pub(crate) arrived: Vec<Arc<Keyframe>>,
+}
+
+/// A trial has ended.
+pub(crate) struct Ended {
+    /// The state to restore, where the change is rejected.
+    pub(crate) restored: Option<State>,
+    /// Keyframes that the restored state has splats of and the other one does not know yet.
+    pub(crate) seeded: Vec<Arc<Keyframe>>,
+    /// Keyframes to learn from now.
+    pub(crate) deferred: Vec<Arc<Keyframe>>,
+}
+
+/// A trial under way, for a checkpoint: its second half where there are scores of the first.
+pub(crate) type UnderWay<'a> = (&'a Running, Option<&'a Scores>);
 
 /// What is still to be tried.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -226,6 +294,8 @@ pub(crate) enum Due {
     Begin(Candidate),
     /// Score; go back to the copy; change what is tried.
     Turn,
+    /// Learn from a keyframe that arrived at this step of the first half.
+    Arrival,
     /// Score; decide.
     End,
     /// Score with and without gains of images; decide.
@@ -267,19 +337,28 @@ impl Trials {
 
     /// Whether there may be more splats.
     pub(crate) fn may_grow(&self) -> bool {
-        let candidate = match &self.phase {
-            Phase::Without { candidate, .. } | Phase::With { candidate, .. } => Some(candidate),
+        let is_halving = matches!(self.under_way(), Some((Running { candidate: Candidate::Halved { .. }, .. }, _)));
+        matches!(self.count, Count::ToCap | Count::Growing) && !is_halving
+    }
+
+    /// The trial under way.
+    pub(crate) fn under_way(&self) -> Option<UnderWay<'_>> {
+        match &self.phase {
+            Phase::Without(trial) => Some((trial, None)),
+            Phase::With { trial, without_db, .. } => Some((trial, Some(without_db))),
             Phase::Waiting | Phase::Settled => None,
-        };
-        matches!(self.count, Count::ToCap | Count::Growing) && !matches!(candidate, Some(Candidate::Halved { .. }))
+        }
     }
 
     pub(crate) fn due(&self, now: Now) -> Due {
         match &self.phase {
             Phase::Waiting => self.next(now),
-            Phase::Without { until, .. } if now.step >= *until => Due::Turn,
-            Phase::With { until, .. } if now.step >= *until => Due::End,
-            Phase::Without { .. } | Phase::With { .. } | Phase::Settled => Due::Nothing,
+            Phase::Without(trial) if now.step >= trial.until => Due::Turn,
+            Phase::With { trial, .. } if trial.arrivals.front().is_some_and(|next| now.step >= next.step) => {
+                Due::Arrival
+            }
+            Phase::With { trial, .. } if now.step >= trial.until => Due::End,
+            Phase::Without(_) | Phase::With { .. } | Phase::Settled => Due::Nothing,
         }
     }
 
@@ -310,9 +389,50 @@ impl Trials {
     pub(crate) fn steps_left(&self, step: u64) -> u64 {
         match &self.phase {
             Phase::Waiting if step < TRIAL_START => TRIAL_START - step,
-            Phase::Without { until, .. } | Phase::With { until, .. } => until.saturating_sub(step).max(1),
+            Phase::Without(trial) => trial.until.saturating_sub(step).max(1),
+            Phase::With { trial, .. } => {
+                let arrives_at = trial.arrivals.front().map_or(u64::MAX, |next| next.step);
+                trial.until.min(arrives_at).saturating_sub(step).max(1)
+            }
             _ => u64::MAX,
         }
+    }
+
+    /// Takes note of a keyframe to learn from that arrives at a step, and says whether it has to wait for the end of a trial.
+    pub(crate) fn defers(&mut self, keyframe: &Arc<Keyframe>, step: u64) -> bool {
+        match &mut self.phase {
+            Phase::Without(trial) => {
+                trial.arrivals.push_back(Arrival { step, keyframe: keyframe.clone() });
+                false
+            }
+            Phase::With { deferred, .. } => {
+                deferred.push(keyframe.clone());
+                true
+            }
+            Phase::Waiting | Phase::Settled => false,
+        }
+    }
+
+    /// The keyframe that arrives now in the second half of a trial.
+    pub(crate) fn next_arrival(&mut self) -> Option<Arc<Keyframe>> {
+        match &mut self.phase {
+            Phase::With { trial, .. } => trial.arrivals.pop_front().map(|arrival| arrival.keyframe),
+            _ => None,
+        }
+    }
+
+    /// The selection keyframes that a score is the mean over: those of the trial under way, else some spread over all.
+    pub(crate) fn scored(&self) -> Vec<ImageId> {
+        let stride = self.held_back.len().div_ceil(MAX_SCORED).max(1);
+        let spread = || self.held_back.iter().step_by(stride).map(|held_back| id_of(&held_back.keyframe)).collect();
+        self.under_way().map_or_else(spread, |(trial, _)| trial.scored.clone())
+    }
+
+    /// A selection keyframe that is still held back.
+    pub(crate) fn held_back(&mut self, (camera, stamp): &ImageId) -> Option<&mut HeldBack> {
+        let is_it =
+            |held_back: &&mut HeldBack| held_back.keyframe.camera == *camera && held_back.keyframe.stamp == *stamp;
+        self.held_back.iter_mut().find(is_it)
     }
 
     pub(crate) fn begin(&mut self, candidate: Candidate, from: State, n_views: usize) {
@@ -323,15 +443,20 @@ impl Trials {
             _ => SHARED_STEPS,
         };
         let until = from.step + n_steps;
-        self.phase = Phase::Without { candidate, from: Box::new(from), until };
+        let scored = self.scored();
+        self.phase =
+            Phase::Without(Running { candidate, until, other: Box::new(from), scored, arrivals: VecDeque::new() });
     }
 
-    /// The state to go back to, and what to change there.
-    pub(crate) fn turn(&mut self, instead: State, without_db: Vec<f64>) -> Option<(State, Candidate)> {
+    /// Begins the second half.
+    pub(crate) fn turn(&mut self, instead: State, without_db: Scores) -> Option<Turned> {
         match std::mem::replace(&mut self.phase, Phase::Settled) {
-            Phase::Without { candidate, from, until } => {
-                self.phase = Phase::With { candidate, instead: Box::new(instead), without_db, until };
-                Some((*from, candidate))
+            Phase::Without(mut trial) => {
+                let from = *std::mem::replace(&mut trial.other, Box::new(instead));
+                let arrived = trial.arrivals.iter().map(|arrival| arrival.keyframe.clone()).collect();
+                let candidate = trial.candidate;
+                self.phase = Phase::With { trial, without_db, deferred: Vec::new() };
+                Some(Turned { from, candidate, arrived })
             }
             other => {
                 self.phase = other;
@@ -340,20 +465,21 @@ impl Trials {
         }
     }
 
-    /// The state to go on from, where the change does not stay.
-    pub(crate) fn end(&mut self, with_db: &[f64]) -> Option<State> {
-        let Phase::With { candidate, instead, without_db, .. } = std::mem::replace(&mut self.phase, Phase::Waiting)
-        else {
+    /// Judges the change.
+    pub(crate) fn end(&mut self, with_db: &Scores) -> Option<Ended> {
+        let Phase::With { trial, without_db, deferred } = std::mem::replace(&mut self.phase, Phase::Waiting) else {
             return None;
         };
-        let kept = self.judge(candidate, &without_db, with_db);
+        let (without_db, with_db) = paired(&without_db, with_db);
+        let candidate = trial.candidate;
+        let kept = self.judge(candidate, &without_db, &with_db);
         match candidate {
             Candidate::Cameras(_) => drop(self.candidates.pop_front()),
             Candidate::Halved { to, .. } if kept && to > FEWEST_SPLATS => self.count = Count::Falling,
             Candidate::Halved { .. } => self.count = Count::Settled,
             Candidate::ShDegree { from, to } => self.degree = if kept { from } else { to + 1 },
         }
-        (!kept).then_some(*instead)
+        Some(Ended { restored: (!kept).then_some(*trial.other), seeded: Vec::new(), deferred })
     }
 
     /// Decides on gains of images: what is learned from now on, if they pay.
@@ -374,10 +500,14 @@ impl Trials {
         kept
     }
 
-    /// Gives up what is being tried: the state to go back to. It is tried again where training goes on.
-    pub(crate) fn give_up(&mut self) -> Option<State> {
+    /// Gives up what is being tried; it is tried again where training goes on.
+    pub(crate) fn give_up(&mut self) -> Option<Ended> {
         match std::mem::replace(&mut self.phase, Phase::Waiting) {
-            Phase::With { instead, .. } => Some(*instead),
+            Phase::With { trial, deferred, .. } => Some(Ended {
+                restored: Some(*trial.other),
+                seeded: trial.arrivals.into_iter().map(|arrival| arrival.keyframe).collect(),
+                deferred,
+            }),
             other => {
                 self.phase = other;
                 None
@@ -394,12 +524,12 @@ impl Trials {
     /// The state without the change, while one is being tried.
     pub(crate) fn instead(&self) -> Option<&State> {
         match &self.phase {
-            Phase::With { instead, .. } => Some(instead),
+            Phase::With { trial, .. } => Some(&trial.other),
             _ => None,
         }
     }
 
-    /// What a checkpoint has to hold; a trial that has not ended begins anew.
+    /// What a checkpoint has to hold beside a trial under way.
     pub(crate) fn untried(&self) -> Untried {
         Untried {
             is_settled: !self.hold_back(),
@@ -416,6 +546,14 @@ impl Trials {
         (self.count, self.degree, self.ended) = (untried.count, untried.degree, ended);
     }
 
+    /// Goes on with a trial that a checkpoint holds; it is in its second half where there are scores of the first.
+    pub(crate) fn restore_trial(&mut self, trial: Running, without_db: Option<Scores>) {
+        self.phase = match without_db {
+            Some(without_db) => Phase::With { trial, without_db, deferred: Vec::new() },
+            None => Phase::Without(trial),
+        };
+    }
+
     /// Says whether these were to be tried; they were found to be needed in another way.
     pub(crate) fn need_not_try(&mut self, found: TermSet) -> bool {
         let n = self.candidates.len();
@@ -426,6 +564,14 @@ impl Trials {
     /// Forgets a keyframe.
     pub(crate) fn remove(&mut self, gone: impl Fn(&Keyframe) -> bool) {
         self.held_back.retain(|held_back| !gone(&held_back.keyframe));
+        match &mut self.phase {
+            Phase::Without(trial) => trial.arrivals.retain(|arrival| !gone(&arrival.keyframe)),
+            Phase::With { trial, deferred, .. } => {
+                trial.arrivals.retain(|arrival| !gone(&arrival.keyframe));
+                deferred.retain(|keyframe| !gone(keyframe));
+            }
+            Phase::Waiting | Phase::Settled => {}
+        }
     }
 }
 

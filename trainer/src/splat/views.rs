@@ -9,6 +9,7 @@ use super::params::{Camera, LOW_PASS_PX2, TILE_PX};
 use crate::gpu::{Buffer, Gpu, f32_of};
 use crate::{Error, Keyframe};
 use nalgebra::Point3;
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 /// Nearest and furthest a splat may be from a keyframe's camera along z to be learned from it, metres.
@@ -69,6 +70,60 @@ pub(crate) struct Level {
     pub(crate) image: Buffer,
     /// Metres along z in the color camera, 0 where unknown.
     pub(crate) depth: Buffer,
+    /// When it was last needed, see [`drop_levels`].
+    used_at: u64,
+}
+
+impl Level {
+    /// GPU memory of the images.
+    fn bytes(&self) -> u64 {
+        self.image.bytes() + self.depth.bytes()
+    }
+}
+
+/// Which images stay on the GPU.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Keep<'a> {
+    /// Views and levels that the next steps need; they stay whatever their size.
+    pub(crate) needed: &'a BTreeSet<(usize, usize)>,
+    /// Levels coarser than this are no longer learned from.
+    pub(crate) coarsest: u32,
+    /// Most bytes of the images that stay.
+    pub(crate) max_bytes: u64,
+}
+
+/// Removes images from the GPU and returns their buffers for reuse.
+///
+/// Images at a resolution that training has passed go first. If the rest is still larger than `max_bytes`, the images used last
+/// go next: every view is used once per round, so the others are needed sooner.
+pub(crate) fn drop_levels(views: &mut [TrainView], keep: Keep<'_>) -> Vec<Level> {
+    let mut dropped = Vec::new();
+    let mut candidates = Vec::new();
+    let mut bytes = 0;
+    for (view_ix, view) in views.iter_mut().enumerate() {
+        let coarsest = view.clamped(keep.coarsest);
+        for level_ix in 0..view.levels.len() {
+            let is_needed = keep.needed.contains(&(view_ix, level_ix));
+            if level_ix > coarsest && !is_needed {
+                dropped.extend(view.levels[level_ix].take());
+            } else if let Some(level) = &view.levels[level_ix] {
+                bytes += level.bytes();
+                if !is_needed {
+                    candidates.push((level.used_at, view_ix, level_ix));
+                }
+            }
+        }
+    }
+    if bytes > keep.max_bytes {
+        candidates.sort_unstable();
+        while let (true, Some((_, view_ix, level_ix))) = (bytes > keep.max_bytes, candidates.pop()) {
+            if let Some(level) = views[view_ix].levels[level_ix].take() {
+                bytes -= level.bytes();
+                dropped.push(level);
+            }
+        }
+    }
+    dropped
 }
 
 impl TrainView {
@@ -95,38 +150,71 @@ impl TrainView {
         level.min((width.min(height) / TILE_PX).max(1).ilog2()) as usize
     }
 
+    /// Size of the image at a level, pixels.
+    pub(crate) fn size_at(&self, level: usize) -> [u32; 2] {
+        self.keyframe.size_px.map(|px| (px >> level).max(1))
+    }
+
+    /// GPU memory of its images.
+    #[cfg(test)]
+    pub(crate) fn image_bytes(&self) -> u64 {
+        self.levels.iter().flatten().map(Level::bytes).sum()
+    }
+
     pub(crate) fn has_level(&self, level: usize) -> bool {
         self.levels[level].is_some()
     }
 
-    /// Takes the images of a level.
-    pub(crate) fn upload(&mut self, gpu: &Gpu, level: usize, images: &LevelImages) -> Result<(), Error> {
-        self.levels[level] = Some(Level {
-            size_px: images.camera.size_px,
-            view: gpu.uniform_with("splat.view", &images.camera.view()),
-            image: gpu.storage_with("splat.target_image", &images.image)?,
-            depth: gpu.storage_with("splat.target_depth", bytemuck::cast_slice(&images.depth_m))?,
+    /// Notes that a level is needed at `now`, a count that grows.
+    pub(crate) fn touch(&mut self, level: usize, now: u64) {
+        if let Some(level) = &mut self.levels[level] {
+            level.used_at = now;
+        }
+    }
+
+    /// Uploads the images of a level, into the buffers of a dropped level of the same size where there is one.
+    pub(crate) fn upload(
+        &mut self,
+        gpu: &Gpu,
+        level: usize,
+        images: &LevelImages,
+        reused: Option<Level>,
+    ) -> Result<(), Error> {
+        let depth_bytes = bytemuck::cast_slice(&images.depth_m);
+        let (size_px, view) = (images.camera.size_px, images.camera.view());
+        self.levels[level] = Some(match reused {
+            Some(reused) => {
+                gpu.write(&reused.view, 0, bytemuck::bytes_of(&view));
+                gpu.write(&reused.image, 0, &images.image);
+                match depth_bytes {
+                    [] => gpu.clear(&reused.depth, 0, reused.depth.bytes()),
+                    _ => gpu.write(&reused.depth, 0, depth_bytes),
+                }
+                Level { size_px, ..reused }
+            }
+            None => Level {
+                size_px,
+                view: gpu.uniform_with("splat.view", &view),
+                image: gpu.storage_with("splat.target_image", &images.image)?,
+                depth: match depth_bytes {
+                    // A new buffer is zero: nothing is known anywhere.
+                    [] => gpu.storage("splat.target_depth", 4 * u64::from(size_px[0]) * u64::from(size_px[1]))?,
+                    _ => gpu.storage_with("splat.target_depth", depth_bytes)?,
+                },
+                used_at: 0,
+            },
         });
         Ok(())
     }
-
-    /// The keyframe `2^level` times smaller, uploaded at first use.
-    pub(crate) fn level(&mut self, gpu: &Gpu, level: u32) -> Result<&Level, Error> {
-        let level = self.clamped(level);
-        if self.levels[level].is_none() {
-            let images = LevelImages::new(&self.keyframe, level);
-            self.upload(gpu, level, &images)?;
-        }
-        self.levels[level].as_ref().ok_or(Error::DeviceLost)
-    }
 }
 
-/// A keyframe made smaller, in host memory.
+/// A keyframe made smaller, in host memory; at full size its pixels are the keyframe's own.
 #[derive(Debug)]
 pub(crate) struct LevelImages {
     camera: Camera,
-    image: Vec<u8>,
-    depth_m: Vec<f32>,
+    image: Arc<[u8]>,
+    /// Empty where the keyframe has no depth.
+    depth_m: Arc<[f32]>,
 }
 
 impl LevelImages {
@@ -137,6 +225,15 @@ impl LevelImages {
             shrunk_depth(keyframe, camera.size_px, level as u32),
         );
         Self { camera, image, depth_m }
+    }
+
+    /// GPU memory that the images take.
+    pub(crate) fn bytes(&self) -> u64 {
+        (self.image.len() + size_of_val(&*self.depth_m)) as u64
+    }
+
+    pub(crate) fn size_px(&self) -> [u32; 2] {
+        self.camera.size_px
     }
 }
 
@@ -165,9 +262,9 @@ pub(crate) fn camera_of(keyframe: &Keyframe) -> Camera {
 }
 
 /// Means over squares of pixels; masked where any of them is.
-fn shrunk_image(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Vec<u8> {
+fn shrunk_image(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[u8]> {
     if level == 0 {
-        return keyframe.rgba_srgb.to_vec();
+        return keyframe.rgba_srgb.clone();
     }
     let width = keyframe.size_px[0] as usize;
     let edge = 1usize << level;
@@ -189,14 +286,15 @@ fn shrunk_image(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Vec<u8> {
             shrunk.push(if seen { 255 } else { 0 });
         }
     }
-    shrunk
+    shrunk.into()
 }
 
-/// The reading at the middle of each square: means would invent surfaces between near and far.
-fn shrunk_depth(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Vec<f32> {
+/// The reading at the middle of each square: means would invent surfaces between near and far. Empty for a keyframe without
+/// depth.
+fn shrunk_depth(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[f32]> {
     let full = depth_in_color_view(keyframe);
-    if full.is_empty() {
-        return vec![0.0; (size_px[0] * size_px[1]) as usize];
+    if full.is_empty() || level == 0 {
+        return full;
     }
     let width = keyframe.size_px[0] as usize;
     let (edge, middle) = (1usize << level, (1usize << level) / 2);

@@ -9,12 +9,11 @@
 
 mod quantize;
 
-use crate::Error;
 use crate::splat::arrays::SplatArrays;
+use crate::{Error, whole_file};
 use flate2::Compression;
 use flate2::bufread::GzDecoder;
 use flate2::write::GzEncoder;
-use std::fs::File;
 use std::io::{ErrorKind, Read, Write};
 use std::path::Path;
 
@@ -45,14 +44,11 @@ pub fn read(path: &Path) -> Result<SplatArrays, Error> {
 /// Values past what the format holds end at its bounds, except means, which are refused beyond 8388 km.
 pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
     let plain = plain_bytes(&splats.clone().checked()?)?;
-    let partial = path.with_extension("spz.part");
-    let written = File::create(&partial).and_then(|file| {
+    whole_file::write(path, |file| {
         let mut gzip = GzEncoder::new(file, Compression::default());
         gzip.write_all(&plain)?;
-        gzip.finish()?.sync_all()?;
-        std::fs::rename(&partial, path)
-    });
-    written.map_err(|source| Error::Write { path: path.to_owned(), source })
+        gzip.finish().map(drop)
+    })
 }
 
 /// What the file says before the splats.

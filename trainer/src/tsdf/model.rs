@@ -17,6 +17,7 @@ use super::passes::{self, Canvas, FrameSlot};
 use crate::align::Alignment;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming, Passes, PendingRead};
+use crate::method::submit_millis;
 use crate::seen::Seen;
 use crate::splat::{Camera, PosedLens, projections};
 use crate::{Error, Keyframe, Method, Part, Picture, Progress, Projection, RenderRequest, Renewable, Split};
@@ -68,6 +69,8 @@ pub struct TsdfModel {
     n_on_gpu: u32,
     step: u64,
     step_millis: f64,
+    /// Whether pictures are asked for.
+    is_watched: bool,
 }
 
 #[derive(Debug)]
@@ -111,6 +114,7 @@ impl TsdfModel {
             n_on_gpu: 0,
             step: 0,
             step_millis: 0.0,
+            is_watched: false,
             gpu,
             options,
         })
@@ -190,6 +194,16 @@ impl TsdfModel {
         Ok(())
     }
 
+    /// Keyframes of a submit that takes no longer than it may.
+    fn frames_per_submit(&self) -> usize {
+        if !self.is_watched || self.step_millis == 0.0 {
+            return FRAMES_PER_SUBMIT;
+        }
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
+        let n = (submit_millis(true) / self.step_millis).clamp(1.0, FRAMES_PER_SUBMIT as f64) as usize;
+        n
+    }
+
     /// Takes the first pending keyframe for done.
     fn pass_over(&mut self) {
         if let Some(keyframe) = self.pending.pop_front() {
@@ -265,16 +279,16 @@ impl TsdfModel {
     }
 
     /// Draws one pinhole view.
-    fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3]) -> Result<Picture, Error> {
+    fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3], depth: bool) -> Result<Picture, Error> {
         if !self.record_picture(camera, background_srgb)? {
-            return Ok(Picture::empty(camera.size_px, background_srgb));
+            return Ok(Picture::empty(camera.size_px, background_srgb, depth));
         }
-        self.passes.submit(&self.gpu);
         let canvas = self.canvas.as_ref().ok_or(Error::DeviceLost)?;
-        let n = camera.size_px[0] as usize * camera.size_px[1] as usize;
-        let pixels: Vec<u32> = self.gpu.read(&canvas.pixels, n)?;
-        let depth_m = self.gpu.read(&canvas.depths, n)?;
-        Ok(Picture { size_px: camera.size_px, rgba_srgb: bytemuck::cast_slice(&pixels).to_vec(), depth_m })
+        let read = self.passes.submit_reading(
+            &self.gpu,
+            &Picture::buffers(camera.size_px, &canvas.pixels, depth.then_some(&canvas.depths)),
+        );
+        read.finish_with(&self.gpu, |parts| Picture::of_parts(camera.size_px, parts))
     }
 
     /// GPU time of a pinhole picture, milliseconds, without bringing it to the host; `None` where the adapter tells none.
@@ -320,7 +334,7 @@ fn in_field(camera: &Camera, lattice: &Lattice) -> Camera {
 impl Renewable for TsdfModel {
     fn begin_anew(&mut self) -> Result<(), Error> {
         self.settle()?;
-        *self = Self::new(self.gpu.clone(), self.options.clone())?;
+        *self = Self { is_watched: self.is_watched, ..Self::new(self.gpu.clone(), self.options.clone())? };
         Ok(())
     }
 }
@@ -356,7 +370,7 @@ impl Method for TsdfModel {
         let n_in_flight = self.in_flight.as_ref().map_or(0, |in_flight| in_flight.n_frames);
         let n_left = (self.pending.len() - n_in_flight.min(self.pending.len())) as u64;
         let n_asked = n.saturating_sub(n_in_flight as u64); // `progress` does not know of those in flight.
-        let n_frames = usize::try_from(n_asked.min(n_left)).unwrap_or(usize::MAX).min(FRAMES_PER_SUBMIT);
+        let n_frames = usize::try_from(n_asked.min(n_left)).unwrap_or(usize::MAX).min(self.frames_per_submit());
         if n_frames == 0 {
             self.settle()?;
             return Ok(self.step - before);
@@ -365,9 +379,8 @@ impl Method for TsdfModel {
         for ix in 0..n_frames {
             self.record(n_in_flight + ix, ix)?;
         }
-        self.passes.submit(&self.gpu);
         let field = self.field.as_ref().ok_or(Error::DeviceLost)?;
-        let status = self.gpu.begin_read(&field.status, status::LEN);
+        let status = self.passes.submit_reading(&self.gpu, &[(&field.status, 4 * status::LEN)]);
         let failed = self.settle()?; // The submit before; this one runs meanwhile.
         if !failed {
             self.in_flight = Some(InFlight { status, n_frames, since });
@@ -403,7 +416,11 @@ impl Method for TsdfModel {
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         self.settle()?;
         self.fuse_first()?;
-        projections::render(request, |camera| self.draw_view(camera, request.background_srgb))
+        projections::render(request, |camera| self.draw_view(camera, request.background_srgb, request.depth))
+    }
+
+    fn set_watched(&mut self, watched: bool) {
+        self.is_watched = watched;
     }
 
     fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {

@@ -340,6 +340,9 @@ fn a_saved_model_draws_the_same_bits() {
     let mut requests = vec![scenes::request(view_of(&keyframes[1]))];
     requests.push(RenderRequest { projection: Projection::Equirectangular, size_px: [64, 32], ..requests[0].clone() });
     for request in requests {
+        let without_depth = model.render(&RenderRequest { depth: false, ..request.clone() }).unwrap();
+        assert!(without_depth.depth_m.is_empty());
+        assert!(without_depth.rgba_srgb == model.render(&request).unwrap().rgba_srgb);
         assert!(same(&loaded.render(&request).unwrap(), &model.render(&request).unwrap()));
     }
     assert!(loaded.mesh().unwrap() == model.mesh().unwrap());

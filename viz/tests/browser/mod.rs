@@ -58,10 +58,15 @@ impl Browser {
         let target = browser.call("Target.createTarget", json!({"url": "about:blank"}));
         let attached = browser.call("Target.attachToTarget", json!({"targetId": target["targetId"], "flatten": true}));
         browser.session = attached["sessionId"].as_str().expect("a session").to_owned();
-        let size = json!({"width": width, "height": height, "deviceScaleFactor": 1, "mobile": false});
-        browser.call("Emulation.setDeviceMetricsOverride", size);
+        browser.resize([width, height]);
         browser.call("Page.navigate", json!({"url": url}));
         browser
+    }
+
+    /// Changes the window's size in CSS pixels.
+    pub(crate) fn resize(&mut self, [width, height]: [u32; 2]) {
+        let size = json!({"width": width, "height": height, "deviceScaleFactor": 1, "mobile": false});
+        self.call("Emulation.setDeviceMetricsOverride", size);
     }
 
     /// Calls a method of the debugging protocol.

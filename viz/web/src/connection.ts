@@ -1,10 +1,24 @@
-// The WebSocket: opens it, opens it again when it breaks, hands messages on.
+// The WebSocket: opens it, notices when it is silent, opens it again when it breaks, hands messages on.
 
-import { type BinaryHeader, PROTOCOL_VERSION, type RenderMessage, type TextMessage, unframe } from "./protocol";
+import { type BinaryHeader, type ClientMessage, PROTOCOL_VERSION, type TextMessage, unframe } from "./protocol";
+import { ServerClock } from "./server_clock";
 
-const RETRY_MILLIS = 1000;
+const CHECK_MILLIS = 100;
+const PING_MILLIS = 500;
+/** The server sends a heartbeat four times a second; longer silence means that something is wrong. */
+const SILENT_MILLIS = 800;
+/** After this much silence, another connection is tried. */
+const GIVE_UP_MILLIS = 4000;
+/** An attempt that brings no message within this time is given up. */
+const ATTEMPT_MILLIS = 2000;
+/** Pauses before the next attempts; a server on this computer or behind a tunnel is back within a second. */
+const RETRY_MILLIS = [250, 500, 1000];
+/** After a check this late, messages may be waiting that prove that the server is there: they are handled first. */
+const LATE_MILLIS = 400;
+/** A check this late means that the page or the computer slept. */
+const SUSPENDED_MILLIS = 5000;
 
-export type ConnectionState = "connecting" | "open" | "lost";
+export type ConnectionState = "connecting" | "open" | "silent" | "lost";
 
 export interface ConnectionEvents {
   state(state: ConnectionState, text: string): void;
@@ -13,50 +27,141 @@ export interface ConnectionEvents {
 }
 
 export class Connection {
+  readonly clock = new ServerClock();
   private socket: WebSocket | null = null;
   private goodbye = "";
+  private state: ConnectionState = "connecting";
+  private heardAt = performance.now();
+  private pingedAt = -Infinity;
+  private checkedAt = performance.now();
+  private lostAt = 0;
+  private retryAt = 0;
+  private nRetries = 0;
 
   constructor(private readonly url: string, private readonly events: ConnectionEvents) {
     this.open();
+    window.setInterval(() => {
+      const late = performance.now() - this.checkedAt;
+      if (late > SUSPENDED_MILLIS) this.clock.forget();
+      if (late > LATE_MILLIS) window.setTimeout(() => this.check(), 0);
+      else this.check();
+    }, CHECK_MILLIS);
   }
 
   get isOpen(): boolean {
-    return this.socket?.readyState === WebSocket.OPEN;
+    return this.socket?.readyState === WebSocket.OPEN && (this.state === "open" || this.state === "silent");
   }
 
-  send(message: RenderMessage): void {
-    if (this.isOpen) this.socket?.send(JSON.stringify(message));
+  send(message: ClientMessage): void {
+    if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
   }
 
   private open(): void {
     const socket = new WebSocket(this.url);
     socket.binaryType = "arraybuffer";
-    socket.onmessage = (event) => this.receive(event.data as string | ArrayBuffer);
+    // Speaking at once shows the server that somebody is here: silent clients give way to new ones.
+    socket.onopen = () => this.ping();
+    socket.onmessage = (event) => {
+      if (socket === this.socket) this.receive(event.data as string | ArrayBuffer);
+    };
     socket.onclose = () => {
-      this.events.state("lost", this.goodbye ? `${this.goodbye}, trying again` : "no connection, trying again");
-      window.setTimeout(() => this.open(), RETRY_MILLIS);
+      if (socket === this.socket) this.lose();
     };
     this.socket = socket;
+    this.heardAt = performance.now();
+    this.clock.forget();
+  }
+
+  /** Gives the socket up; a new one follows after a pause. */
+  private lose(): void {
+    const socket = this.socket;
+    this.socket = null;
+    socket?.close();
+    const now = performance.now();
+    if (this.state !== "lost") {
+      this.state = "lost";
+      this.lostAt = now;
+    }
+    this.retryAt = now + RETRY_MILLIS[Math.min(this.nRetries, RETRY_MILLIS.length - 1)]!;
+    this.nRetries += 1;
+    this.report();
+  }
+
+  private check(): void {
+    const now = performance.now();
+    this.checkedAt = now;
+    if (!this.socket) {
+      if (now >= this.retryAt) this.open();
+      else this.report();
+      return;
+    }
+    const silence = now - this.heardAt;
+    const isTrying = this.state === "lost" || this.state === "connecting";
+    if (silence > (isTrying ? ATTEMPT_MILLIS : GIVE_UP_MILLIS)) {
+      this.lose();
+    } else if (this.state === "lost") {
+      this.report();
+    } else if (silence > SILENT_MILLIS) {
+      this.state = "silent";
+      this.report();
+    }
+    if (now - this.pingedAt >= PING_MILLIS) this.ping();
+  }
+
+  private ping(): void {
+    this.pingedAt = performance.now();
+    this.send({ type: "ping", t: this.pingedAt });
+  }
+
+  private report(): void {
+    const seconds = (since: number): string => `${Math.max(1, Math.round((performance.now() - since) / 1000))} s`;
+    switch (this.state) {
+      case "silent":
+        this.events.state("silent", `no data from the server for ${seconds(this.heardAt)}`);
+        break;
+      case "lost": {
+        const why = this.goodbye || "connection lost";
+        this.events.state("lost", `${why}, reconnecting for ${seconds(this.lostAt)}`);
+        break;
+      }
+      default:
+        this.events.state(this.state, this.state === "open" ? `connected to ${location.host}` : "connecting");
+    }
   }
 
   private receive(data: string | ArrayBuffer): void {
+    this.heardAt = performance.now();
+    if (this.state === "silent") {
+      this.state = "open";
+      this.report();
+    }
     if (typeof data !== "string") {
       const { header, payload } = unframe(data);
       this.events.binary(header, payload);
       return;
     }
     const message = JSON.parse(data) as TextMessage;
-    if (message.type === "hello") {
-      this.goodbye = "";
-      if (message.protocol === PROTOCOL_VERSION) {
-        this.events.state("open", `connected to ${location.host}`);
-      } else {
-        this.goodbye = "this page is of another version than the server, reload it";
-        this.socket?.close();
-        return;
-      }
-    } else if (message.type === "goodbye") {
-      this.goodbye = message.reason;
+    switch (message.type) {
+      case "hello":
+        this.goodbye = "";
+        if (message.protocol !== PROTOCOL_VERSION) {
+          this.goodbye = "this page is of another version than the server, reload it";
+          this.lose();
+          return;
+        }
+        this.nRetries = 0;
+        this.state = "open";
+        this.report();
+        break;
+      case "heartbeat":
+        this.clock.heard(message.clock_millis);
+        break;
+      case "pong":
+        this.clock.answered(message.t, message.clock_millis);
+        break;
+      case "goodbye":
+        this.goodbye = message.reason;
+        break;
     }
     this.events.text(message);
   }

@@ -2,32 +2,60 @@
 
 import { element } from "./element";
 import type { LiveImageHeader } from "./protocol";
+import type { ServerClock } from "./server_clock";
 
-const STALE_MILLIS = 3000;
+/** Nothing older is called live. */
+const LIVE_MILLIS = 500;
+/** An older image is dimmed. */
+const DIM_MILLIS = 2000;
 
 interface Slot {
+  figure: HTMLElement;
   canvas: HTMLCanvasElement;
   caption: HTMLElement;
   age: HTMLElement;
-  arrivedAt: number;
+  capturedMillis: number;
+  waiting: { header: LiveImageHeader; jpeg: Uint8Array<ArrayBuffer> } | null;
+  isDecoding: boolean;
 }
 
 export class LiveImages {
   private readonly slots = new Map<string, Slot>();
 
-  constructor() {
-    window.setInterval(() => this.tellAges(), 500);
+  constructor(private readonly clock: () => ServerClock) {
+    window.setInterval(() => this.showAges(), 100);
   }
 
-  async show(header: LiveImageHeader, jpeg: Uint8Array<ArrayBuffer>): Promise<void> {
-    const bitmap = await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }));
+  /** Shows an image, unless a newer one of its camera comes before it is decoded. */
+  show(header: LiveImageHeader, jpeg: Uint8Array<ArrayBuffer>): void {
     const slot = this.slots.get(header.camera) ?? this.add(header.camera);
-    slot.arrivedAt = performance.now();
-    slot.canvas.width = bitmap.width;
-    slot.canvas.height = bitmap.height;
-    slot.canvas.getContext("2d")?.drawImage(bitmap, 0, 0);
-    bitmap.close();
-    this.tellAges();
+    slot.waiting = { header, jpeg };
+    if (!slot.isDecoding) void this.decode(slot);
+  }
+
+  private async decode(slot: Slot): Promise<void> {
+    slot.isDecoding = true;
+    for (let next = slot.waiting; next; next = slot.waiting) {
+      slot.waiting = null;
+      try {
+        const bitmap = await createImageBitmap(new Blob([next.jpeg], { type: "image/jpeg" }));
+        slot.capturedMillis = next.header.captured_millis;
+        slot.canvas.width = bitmap.width;
+        slot.canvas.height = bitmap.height;
+        slot.canvas.getContext("2d")?.drawImage(bitmap, 0, 0);
+        bitmap.close();
+      } catch {
+        // The caption shows that the image is getting old.
+      }
+      this.showAges();
+    }
+    slot.isDecoding = false;
+  }
+
+  /** A new server has a new clock: what is shown is from before. */
+  forget(): void {
+    for (const slot of this.slots.values()) slot.capturedMillis = -Infinity;
+    this.showAges();
   }
 
   private add(camera: string): Slot {
@@ -39,18 +67,25 @@ export class LiveImages {
     name.textContent = camera;
     caption.append(name, age);
     figure.append(canvas, caption);
+    figure.dataset.camera = camera;
     element("live").append(figure);
-    const slot = { canvas, caption, age, arrivedAt: 0 };
+    const slot: Slot = { figure, canvas, caption, age, capturedMillis: -Infinity, waiting: null, isDecoding: false };
     this.slots.set(camera, slot);
     return slot;
   }
 
-  private tellAges(): void {
-    for (const { caption, age, arrivedAt } of this.slots.values()) {
-      const millis = performance.now() - arrivedAt;
-      const isStale = millis > STALE_MILLIS;
-      caption.classList.toggle("stale", isStale);
-      age.textContent = isStale ? `${(millis / 1000).toFixed(0)} s old` : "live";
+  private showAges(): void {
+    for (const { figure, caption, age, capturedMillis } of this.slots.values()) {
+      const millis = this.clock().age(capturedMillis) ?? Infinity;
+      caption.classList.toggle("stale", millis > LIVE_MILLIS);
+      figure.classList.toggle("dimmed", millis > DIM_MILLIS);
+      age.textContent = millis > LIVE_MILLIS ? ageText(millis) : "live";
     }
   }
+}
+
+function ageText(millis: number): string {
+  if (!Number.isFinite(millis)) return "not live";
+  const seconds = millis / 1000;
+  return seconds < 120 ? `${seconds.toFixed(seconds < 10 ? 1 : 0)} s old` : `${Math.round(seconds / 60)} min old`;
 }

@@ -1,5 +1,6 @@
 // The operator's page: joins the connection, the view and the readouts.
 
+import { Banner } from "./banner";
 import { Connection } from "./connection";
 import { element } from "./element";
 import { LiveImages } from "./live_images";
@@ -15,22 +16,30 @@ let latestStep = -1;
 let liveCamera: LiveImageHeader | null = null;
 
 const readouts = new Readouts();
-const liveImages = new LiveImages();
+const banner = new Banner();
 const view = new OrbitView(element("canvas", HTMLCanvasElement), () => asker.moved());
 const connection = new Connection(`ws://${location.host}/ws`, {
   state(state, text) {
-    element("connection").dataset.state = state;
-    element("connection").textContent = text;
+    const shown = element("connection");
+    const before = shown.dataset.state;
+    const wasOpen = before === "open" || before === "silent";
+    const hasEnded = state === "lost" && banner.isFinished;
+    shown.dataset.state = hasEnded ? "ended" : state;
+    shown.textContent = hasEnded ? "the server has stopped" : text;
     // Whoever steers by the picture must see that it stands still.
-    element("notice").textContent = state === "lost" ? text : "";
-    if (state === "open") {
+    banner.setConnection(state, text);
+    view.overlays.setLive(state === "open");
+    if (state === "open" && !wasOpen) {
       view.picture.forget();
+      liveImages.forget();
       asker.restart();
     }
+    if (shown.dataset.state !== before) view.changed();
   },
   text: receiveText,
   binary: receiveBinary,
 });
+const liveImages = new LiveImages(() => connection.clock);
 const models = new ModelSwitch(() => {
   asker.restart();
   if (latestStatus) showStatus(latestStatus);
@@ -46,6 +55,7 @@ function receiveText(message: TextMessage): void {
       latestStatus = message;
       models.list(message);
       showStatus(message);
+      banner.setEnded(message.ended);
       break;
     case "scene":
       view.setScene(message);
@@ -58,8 +68,10 @@ function receiveText(message: TextMessage): void {
       asker.failed(message.id);
       element("notice").textContent = message.message;
       break;
+    case "heartbeat":
+    case "pong":
     case "goodbye":
-      break;
+      break; // Handled by the connection.
   }
 }
 
@@ -74,12 +86,12 @@ function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): 
   if (header.type === "picture") {
     void showPicture(header, payload);
   } else {
-    void liveImages.show(header, payload);
+    liveImages.show(header, payload);
     if (header.world_from_camera) {
       liveCamera = header;
       element("look-live", HTMLButtonElement).disabled = false;
-      view.overlays.setLiveCamera({ ...header, world_from_camera: header.world_from_camera });
-      view.changed();
+      const hasMoved = view.overlays.setLiveCamera({ ...header, world_from_camera: header.world_from_camera });
+      if (hasMoved) view.changed();
     }
   }
 }

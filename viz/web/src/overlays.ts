@@ -50,14 +50,26 @@ export class Overlays {
     setLines(this.keyframes, keyframes.flatMap((keyframe) => frustum(keyframe, this.frustumDepth)));
   }
 
-  setLiveCamera(camera: PosedCamera): void {
+  /** Whether the live cameras' poses are current; if not, they are drawn faintly. */
+  setLive(isLive: boolean): void {
+    for (const drawn of this.live.values()) {
+      (drawn.material as THREE.LineBasicMaterial).opacity = isLive ? 1 : 0.3;
+    }
+  }
+
+  /** Draws a camera where it is now; says whether that is elsewhere than before. */
+  setLiveCamera(camera: PosedCamera): boolean {
     let drawn = this.live.get(camera.camera);
+    const place = [...camera.world_from_camera, ...camera.focal_px, this.frustumDepth].join();
+    if (drawn?.name === place) return false;
     if (!drawn) {
       drawn = lines(LIVE_COLOR, 1);
       this.live.set(camera.camera, drawn);
       this.cameras.add(drawn);
     }
+    drawn.name = place;
     setLines(drawn, frustum(camera, 1.6 * this.frustumDepth));
+    return true;
   }
 }
 

@@ -1,7 +1,7 @@
-// The messages of docs/protocol.md, version 1.
+// The messages of docs/protocol.md, version 2.
 
 /** Version this page was written for. */
-export const PROTOCOL_VERSION = 1;
+export const PROTOCOL_VERSION = 2;
 
 export interface Pinhole {
   kind: "pinhole";
@@ -16,6 +16,7 @@ export interface Hello {
   client: number;
   max_size_px: [number, number];
   default_stages: number[];
+  clock_millis: number;
 }
 
 /** Where a model stands. */
@@ -38,6 +39,14 @@ export interface Status extends ModelStatus {
   refused: Record<string, number>;
   others: ModelStatus[];
   notes: string[];
+  ended: Ended | null;
+}
+
+/** Result of a run that has ended. */
+export interface Ended {
+  folder: string | null;
+  scores: string;
+  seconds: number;
 }
 
 export interface Scene {
@@ -65,6 +74,19 @@ export interface ErrorMessage {
   type: "error";
   id: number | null;
   message: string;
+}
+
+/** Sent four times a second. */
+export interface Heartbeat {
+  type: "heartbeat";
+  clock_millis: number;
+}
+
+/** Answers a ping. */
+export interface Pong {
+  type: "pong";
+  t: number;
+  clock_millis: number;
 }
 
 export interface Goodbye {
@@ -100,6 +122,7 @@ export interface LiveImageHeader {
   type: "live_image";
   camera: string;
   stamp_nanos: number;
+  captured_millis: number;
   size_px: [number, number];
   format: "jpeg";
   world_from_camera: number[] | null;
@@ -107,7 +130,7 @@ export interface LiveImageHeader {
   principal_px: [number, number];
 }
 
-export type TextMessage = Hello | Status | Scene | Keyframes | ErrorMessage | Goodbye;
+export type TextMessage = Hello | Status | Scene | Keyframes | ErrorMessage | Heartbeat | Pong | Goodbye;
 export type BinaryHeader = PictureHeader | LiveImageHeader;
 
 export interface RenderMessage {
@@ -123,6 +146,13 @@ export interface RenderMessage {
   outputs: ("color" | "depth")[];
   background_srgb: [number, number, number];
 }
+
+export interface PingMessage {
+  type: "ping";
+  t: number;
+}
+
+export type ClientMessage = RenderMessage | PingMessage;
 
 /** Header and payload of a binary message: u32 little-endian header length, JSON header, payload. */
 export function unframe(message: ArrayBuffer): { header: BinaryHeader; payload: Uint8Array<ArrayBuffer> } {

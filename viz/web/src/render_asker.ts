@@ -21,7 +21,7 @@ const REFRESH_MILLIS = 700;
 const REFRESH_SHARE = 0.25;
 /** A moving picture that takes longer is asked for smaller, one that takes less than a third of it larger. */
 const MOVING_MILLIS = 110;
-const MOVING_SCALES = [0.1, 0.15, 0.25, 0.35, 0.5];
+const MOVING_SCALES = [0.1, 0.15, 0.25, 0.35, 0.5, 0.7, 1];
 /** An answer that does not come within this time is not waited for, while moving and at rest. */
 const PATIENCE_MILLIS = { moving: 3000, resting: 30_000 };
 

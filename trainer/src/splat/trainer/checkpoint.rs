@@ -1,18 +1,19 @@
 //! The state of a splat model in training: all that decides how it goes on, bit for bit.
 
-use super::SplatTrainer;
+use super::{Seeding, SplatTrainer, State as ModelState};
 use crate::align::{Aligning, Alignment};
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
-use crate::gpu::{Gpu, PendingRead};
+use crate::gpu::{Buffer, Gpu, PendingRead};
 use crate::seen::{self, Seen};
 use crate::splat::buffers::{N_PLANED, SplatBuffers};
 use crate::splat::camera_terms::{CameraSlots, TermSet};
 use crate::splat::options::SplatOptions;
 use crate::splat::params::status;
-use crate::splat::seed::Seeder;
-use crate::splat::trials::{Trial, Untried};
+use crate::splat::seed::{Remembered, Seeder};
+use crate::splat::trials::{Arrival, Candidate, Running, Scores, Trial, Untried};
 use crate::splat::views::TrainView;
 use crate::{Error, Keyframe};
+use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
@@ -23,6 +24,8 @@ const ARRAYS: [&str; N_PLANED] =
 const SEED_PLACES: &str = "seed_places";
 const SEED_CELLS: &str = "seed_cells";
 const CAMERA_TERMS: &str = "camera_terms";
+/// Begins the names of the arrays of the other half of a trial under way.
+const OTHER: &str = "other_";
 
 /// All but the arrays.
 #[derive(Debug, Serialize, Deserialize)]
@@ -54,6 +57,199 @@ struct State {
     /// Whether alignment is settled, and what it found; views are told as it corrected them.
     is_aligned: bool,
     alignment: Option<Alignment>,
+    /// A trial under way.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    trial: Option<TrialState>,
+}
+
+/// A trial under way: the half that learns is the state above, and the arrays of the other have names of their own.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct TrialState {
+    candidate: Candidate,
+    until: u64,
+    scored: Vec<Image>,
+    /// Of the first half, once that is over.
+    scores_without: Option<Vec<(Image, f64)>>,
+    arrivals: Vec<ArrivalState>,
+    other: OtherHalf,
+}
+
+/// Camera and stamp, nanoseconds.
+type Image = (String, i64);
+
+/// A keyframe that arrived in the first half of a trial. In the second half it is no view until it arrives again.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct ArrivalState {
+    step: u64,
+    image: Seen,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct OtherHalf {
+    step: u64,
+    schedule_start: u64,
+    grown_at: u64,
+    n_splats: u32,
+    capacity: u32,
+    sh_degree: u32,
+    active_degree: u32,
+    scene_size_m: f64,
+    has_depth: bool,
+    n_seeds: u64,
+    terms: TermSet,
+    n_term_bytes: u64,
+}
+
+fn image((camera, stamp): &(Arc<str>, Stamp)) -> Image {
+    (camera.to_string(), stamp.0)
+}
+
+fn id((camera, nanos): Image) -> (Arc<str>, Stamp) {
+    (camera.into(), Stamp(nanos))
+}
+
+impl TrialState {
+    fn of(trial: &Running, without_db: Option<&Scores>) -> Self {
+        let ModelState { splats, cameras: (terms, term_buffer), step, grown_at, seeding } = &*trial.other;
+        Self {
+            candidate: trial.candidate,
+            until: trial.until,
+            scored: trial.scored.iter().map(image).collect(),
+            scores_without: without_db.map(|scores| scores.iter().map(|(of, db)| (image(of), *db)).collect()),
+            arrivals: trial
+                .arrivals
+                .iter()
+                .map(|Arrival { step, keyframe }| ArrivalState { step: *step, image: Seen::of(keyframe) })
+                .collect(),
+            other: OtherHalf {
+                step: *step,
+                schedule_start: seeding.schedule_start,
+                grown_at: *grown_at,
+                n_splats: splats.n_splats,
+                capacity: splats.capacity,
+                sh_degree: splats.sh_degree,
+                active_degree: splats.active_degree(),
+                scene_size_m: seeding.scene_size_m,
+                has_depth: seeding.has_depth,
+                n_seeds: seeding.seeder.n_seeds() as u64,
+                terms: *terms,
+                n_term_bytes: term_buffer.bytes(),
+            },
+        }
+    }
+
+    /// The trial, with the state of its other half and the keyframes of its arrivals.
+    fn restored(
+        self,
+        gpu: &Gpu,
+        checkpoint: &Checkpoint,
+        keyframes: &[Arc<Keyframe>],
+    ) -> Result<(Running, Option<Scores>), Error> {
+        let other = self.other;
+        let size = [other.n_splats, other.capacity, other.sh_degree, other.active_degree];
+        let state = ModelState {
+            splats: read_splats(gpu, checkpoint, OTHER, size)?,
+            cameras: (
+                other.terms,
+                gpu.storage_with(
+                    "splat.camera_terms",
+                    checkpoint.array(&format!("{OTHER}{CAMERA_TERMS}"), other.n_term_bytes)?,
+                )?,
+            ),
+            step: other.step,
+            grown_at: other.grown_at,
+            seeding: Seeding {
+                seeder: read_seeds(checkpoint, OTHER, other.n_seeds)?,
+                scene_size_m: other.scene_size_m,
+                has_depth: other.has_depth,
+                schedule_start: other.schedule_start,
+            },
+        };
+        let arrivals = self.arrivals.iter().zip(keyframes);
+        let trial = Running {
+            candidate: self.candidate,
+            until: self.until,
+            other: Box::new(state),
+            scored: self.scored.into_iter().map(id).collect(),
+            arrivals: arrivals.map(|(at, keyframe)| Arrival { step: at.step, keyframe: keyframe.clone() }).collect(),
+        };
+        let scores = self.scores_without.map(|scores| scores.into_iter().map(|(of, db)| (id(of), db)).collect());
+        Ok((trial, scores))
+    }
+}
+
+/// Splats of `[n_splats, capacity, sh_degree, active_degree]` out of the arrays whose names begin like this.
+fn read_splats(
+    gpu: &Gpu,
+    checkpoint: &Checkpoint,
+    prefix: &str,
+    [n_splats, capacity, sh_degree, active_degree]: [u32; 4],
+) -> Result<SplatBuffers, Error> {
+    if n_splats > capacity || active_degree > sh_degree || sh_degree > 3 {
+        return Err(bad_state(format!("{n_splats} splats of degree {active_degree} do not fit")));
+    }
+    let mut splats = SplatBuffers::new(gpu, capacity, sh_degree)?;
+    for (name, (buffer, n_planes, bytes)) in ARRAYS.into_iter().zip(splats.planes()) {
+        let used_bytes = u64::from(n_splats) * bytes;
+        let array = checkpoint.array(&format!("{prefix}{name}"), u64::from(n_planes) * used_bytes)?;
+        for plane in 0..u64::from(n_planes) {
+            let from = to_usize(plane * used_bytes);
+            let at = plane * u64::from(capacity) * bytes;
+            gpu.write(buffer, at, &array[from..from + to_usize(used_bytes)]);
+        }
+    }
+    splats.set_active_degree(gpu, active_degree);
+    splats.set_n(gpu, n_splats);
+    Ok(splats)
+}
+
+fn read_seeds(checkpoint: &Checkpoint, prefix: &str, n_seeds: u64) -> Result<Seeder, Error> {
+    let array = |name: &str, bytes: u64| {
+        let n_bytes = n_seeds.checked_mul(bytes).ok_or_else(|| bad_state(format!("{n_seeds} seeds")))?;
+        checkpoint.array(&format!("{prefix}{name}"), n_bytes)
+    };
+    Ok(Seeder::of_bytes(array(SEED_PLACES, Seeder::PLACE_BYTES)?, array(SEED_CELLS, Seeder::CELL_BYTES)?))
+}
+
+/// The arrays of one state of the model on their way to the host.
+struct PendingArrays {
+    prefix: &'static str,
+    planes: Vec<Planes>,
+    seeds: Remembered,
+    terms: Option<PendingRead>,
+}
+
+impl PendingArrays {
+    fn begin(gpu: &Gpu, prefix: &'static str, splats: &SplatBuffers, seeder: &Seeder, terms: (&Buffer, u64)) -> Self {
+        let planes = splats.planes().map(|(buffer, n_planes, bytes)| Planes {
+            read: begin_read(gpu, buffer, n_planes, bytes, splats),
+            n_planes: n_planes as usize,
+            used_bytes: splats.n_splats as usize * to_usize(bytes),
+            stride_bytes: splats.capacity as usize * to_usize(bytes),
+        });
+        let (buffer, n_bytes) = terms;
+        Self {
+            prefix,
+            planes: planes.into(),
+            seeds: seeder.remembered(),
+            terms: (n_bytes > 0).then(|| gpu.begin_read(buffer, to_usize(n_bytes / 4))),
+        }
+    }
+
+    fn finish(self, gpu: &Gpu, arrays: &mut Vec<Array>) -> Result<(), Error> {
+        let mut add = |name: &str, bytes| arrays.push(Array { name: format!("{}{name}", self.prefix), bytes });
+        for (name, planes) in ARRAYS.into_iter().zip(self.planes) {
+            add(name, planes.finish(gpu)?);
+        }
+        let (places, cells) = self.seeds.into_bytes();
+        add(SEED_PLACES, places);
+        add(SEED_CELLS, cells);
+        add(CAMERA_TERMS, self.terms.map_or(Ok(Vec::new()), |read| read.finish(gpu))?);
+        Ok(())
+    }
 }
 
 impl SplatTrainer {
@@ -62,12 +258,7 @@ impl SplatTrainer {
     pub(super) fn take_checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         self.seed_from_depth()?;
         self.settle()?;
-        // A trial that has not ended is forgotten: it begins anew where training goes on.
-        let undecided = self.trials.instead();
-        let (splats, step, grown_at) = undecided
-            .map_or((&self.splats, self.step, self.grown_at), |state| (&state.splats, state.step, state.grown_at));
-        let (terms, term_buffer) =
-            undecided.map_or((self.cameras.set, &self.cameras.terms), |state| (state.cameras.0, &state.cameras.1));
+        let splats = &self.splats;
         let place = |keyframe: &Arc<Keyframe>| self.views.iter().position(|view| Arc::ptr_eq(&view.keyframe, keyframe));
         let state = State {
             options: SplatOptions {
@@ -75,9 +266,9 @@ impl SplatTrainer {
                 seeds_per_image: Some(self.seeds_per_image),
                 ..self.options.clone()
             },
-            step,
+            step: self.step,
             schedule_start: self.schedule_start,
-            grown_at,
+            grown_at: self.grown_at,
             n_poisoned: u32::try_from(self.n_poisoned).unwrap_or(u32::MAX),
             n_splats: splats.n_splats,
             capacity: splats.capacity,
@@ -89,33 +280,25 @@ impl SplatTrainer {
             views: self.views.iter().map(|view| Seen::of(&view.keyframe)).collect(),
             unseeded: self.unseeded.iter().filter_map(place).collect(),
             slots: self.cameras.slots(),
-            terms,
+            terms: self.cameras.set,
             untried: self.trials.untried(),
             tried: self.trials.ended.clone(),
             is_aligned: self.aligning.is_done(),
             alignment: self.aligning.result().cloned(),
+            trial: self.trials.under_way().map(|(trial, without_db)| TrialState::of(trial, without_db)),
         };
         let state =
             serde_json::to_value(state).map_err(|error| Error::CheckpointState { reason: error.to_string() })?;
-        let planes = splats.planes().map(|(buffer, n_planes, bytes)| Planes {
-            read: begin_read(&self.gpu, buffer, n_planes, bytes, splats),
-            n_planes: n_planes as usize,
-            used_bytes: splats.n_splats as usize * to_usize(bytes),
-            stride_bytes: splats.capacity as usize * to_usize(bytes),
-        });
-        let term_words = to_usize(self.cameras.used_bytes().min(term_buffer.bytes()) / 4);
-        let terms = (term_words > 0).then(|| self.gpu.begin_read(term_buffer, term_words));
-        let (gpu, seeds) = (self.gpu.clone(), self.seeder.remembered());
+        let terms = (&self.cameras.terms, self.cameras.used_bytes());
+        let mut halves = vec![PendingArrays::begin(&self.gpu, "", splats, &self.seeder, terms)];
+        if let Some((Running { other, .. }, _)) = self.trials.under_way() {
+            let terms = (&other.cameras.1, other.cameras.1.bytes());
+            halves.push(PendingArrays::begin(&self.gpu, OTHER, &other.splats, &other.seeding.seeder, terms));
+        }
+        let gpu = self.gpu.clone();
         Ok(PendingCheckpoint::new(move || {
             let mut arrays = Vec::new();
-            for (name, planes) in ARRAYS.into_iter().zip(planes) {
-                arrays.push(Array { name: name.to_owned(), bytes: planes.finish(&gpu)? });
-            }
-            let (places, cells) = seeds.into_bytes();
-            arrays.push(Array { name: SEED_PLACES.to_owned(), bytes: places });
-            arrays.push(Array { name: SEED_CELLS.to_owned(), bytes: cells });
-            let terms: Vec<u8> = terms.map_or(Ok(Vec::new()), |read| read.finish(&gpu))?;
-            arrays.push(Array { name: CAMERA_TERMS.to_owned(), bytes: terms });
+            halves.into_iter().try_for_each(|half| half.finish(&gpu, &mut arrays))?;
             Ok(Checkpoint::new(METHOD, state, arrays))
         }))
     }
@@ -137,36 +320,36 @@ impl SplatTrainer {
         } else {
             Aligning::new(&state.options.align)
         };
-        let (views, rest) = seen::matched(&state.views, keyframes, |keyframe| aligning.corrected(keyframe))?;
-        let n_splats = state.n_splats;
-        if n_splats > state.capacity || state.active_degree > state.sh_degree || state.sh_degree > 3 {
-            return Err(bad_state(format!("{n_splats} splats of degree {} do not fit", state.active_degree)));
-        }
+        // In the second half of a trial some keyframes have yet to arrive again; in the first they are views.
+        let arrivals = || state.trial.iter().flat_map(|trial| &trial.arrivals).map(|arrival| &arrival.image);
+        let is_second_half = state.trial.as_ref().is_some_and(|trial| trial.scores_without.is_some());
+        let yet_to_arrive = arrivals().filter(|_| is_second_half);
+        let known: Vec<Seen> = state.views.iter().chain(yet_to_arrive).cloned().collect();
+        let (mut views, rest) = seen::matched(&known, keyframes, |keyframe| aligning.corrected(keyframe))?;
+        let yet_to_arrive = views.split_off(state.views.len());
+        let arrived =
+            arrivals().filter(|_| !is_second_half).map(|image| state.views.iter().position(|view| view == image));
+        let arrived = arrived.map(|ix| views.get(ix?).cloned()).collect::<Option<Vec<_>>>();
+        let arrived = arrived.ok_or_else(|| bad_state("a view that arrived during a trial is missing".to_owned()))?;
+        let arrivals = [arrived, yet_to_arrive].concat();
         let unseeded = state.unseeded.iter().map(|ix| views.get(*ix).cloned());
         let unseeded = unseeded.collect::<Option<Vec<_>>>().ok_or_else(|| bad_state("a view is missing".to_owned()))?;
         let step = u32::try_from(state.step).map_err(|_| bad_state(format!("step {}", state.step)))?;
 
         let mut trainer = Self::new(gpu, state.options)?;
-        trainer.splats = SplatBuffers::new(&trainer.gpu, state.capacity, state.sh_degree)?;
-        for (name, (buffer, n_planes, bytes)) in ARRAYS.into_iter().zip(trainer.splats.planes()) {
-            let used_bytes = u64::from(n_splats) * bytes;
-            let array = checkpoint.array(name, u64::from(n_planes) * used_bytes)?;
-            for plane in 0..u64::from(n_planes) {
-                let from = to_usize(plane * used_bytes);
-                let at = plane * u64::from(state.capacity) * bytes;
-                trainer.gpu.write(buffer, at, &array[from..from + to_usize(used_bytes)]);
-            }
-        }
-        trainer.splats.set_active_degree(&trainer.gpu, state.active_degree);
-        trainer.splats.set_n(&trainer.gpu, n_splats);
+        let size = [state.n_splats, state.capacity, state.sh_degree, state.active_degree];
+        trainer.splats = read_splats(&trainer.gpu, checkpoint, "", size)?;
         trainer.tell_n();
         for (ix, value) in [(status::STEP, step), (status::N_POISONED, state.n_poisoned)] {
             trainer.gpu.write(&trainer.learn_status, 4 * ix as u64, &value.to_le_bytes());
         }
-        let places = checkpoint.array(SEED_PLACES, state.n_seeds * Seeder::PLACE_BYTES)?;
-        trainer.seeder = Seeder::of_bytes(places, checkpoint.array(SEED_CELLS, state.n_seeds * Seeder::CELL_BYTES)?);
+        trainer.seeder = read_seeds(checkpoint, "", state.n_seeds)?;
         trainer.cameras.restore(&trainer.gpu, &state.slots, state.terms, checkpoint)?;
         trainer.trials.restore(state.untried, state.tried);
+        if let Some(trial) = state.trial {
+            let (trial, without_db) = trial.restored(&trainer.gpu, checkpoint, &arrivals)?;
+            trainer.trials.restore_trial(trial, without_db);
+        }
         trainer.views = views.into_iter().map(TrainView::new).collect();
         trainer.aligning = aligning;
         trainer.unseeded = unseeded;
@@ -201,13 +384,7 @@ impl Planes {
     }
 }
 
-fn begin_read(
-    gpu: &Gpu,
-    buffer: &crate::gpu::Buffer,
-    n_planes: u32,
-    bytes: u64,
-    splats: &SplatBuffers,
-) -> Option<PendingRead> {
+fn begin_read(gpu: &Gpu, buffer: &Buffer, n_planes: u32, bytes: u64, splats: &SplatBuffers) -> Option<PendingRead> {
     if n_planes == 0 || splats.n_splats == 0 {
         return None;
     }

@@ -1,17 +1,15 @@
 //! How the model as it learns does on images that it has not learned from.
 
-use super::{Fixes, Learn, SplatTrainer, fixed};
+use super::{Fixes, Learn, SplatTrainer, VIEWS_AT_ONCE, Wanted, fixed};
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 use crate::splat::buffers::Frame;
 use crate::splat::camera_terms::between;
 use crate::splat::params::Camera;
-use crate::splat::views::camera_of;
+use crate::splat::trials::Scores;
+use crate::splat::views::{Level, camera_of};
 use crate::{Error, Keyframe};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
-
-/// Most images held back that a score is the mean over.
-const MOST_SCORED: usize = 24;
 
 /// Sums over the pixels of a picture and an image, of each color.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -46,11 +44,85 @@ fn log_gains(products: &[Products; 3]) -> [f64; 3] {
     })
 }
 
+/// Bytes of the sums of a workgroup of `score.wgsl`.
+pub(super) const PRODUCTS_BYTES: usize = 48;
+
+/// Lists the comparison of a picture with an image; says how many workgroups write sums.
+pub(super) fn compare(
+    gpu: &Gpu,
+    passes: &mut Passes,
+    score: &Pipeline,
+    (view, frame): (&Buffer, &Frame),
+    size_px: [u32; 2],
+    image: &Buffer,
+) -> u32 {
+    let n_groups = (size_px[0] * size_px[1]).div_ceil(256);
+    let buffers = [("view", view), ("pixels", &frame.pixels), ("target_image", image), ("products", &frame.products)];
+    passes.dispatch(gpu, score, n_groups.into(), &buffers);
+    n_groups
+}
+
+/// The sums over all workgroups.
+fn sum_up(sums: &[[u32; 4]]) -> [Products; 3] {
+    let sum = |color: usize, part: usize| sums.iter().skip(color).step_by(3).map(|of| u64::from(of[part])).sum();
+    [0, 1, 2].map(|color| Products {
+        picture_picture: sum(color, 0),
+        picture_image: sum(color, 1),
+        image_image: sum(color, 2),
+        n_seen: sum(color, 3),
+    })
+}
+
+/// PSNR, dB, computed as [`crate::eval::psnr`] does, with the same bits: sums of whole numbers have no rounding.
+fn psnr_as_evaluated(products: &[Products; 3]) -> Result<f64, Error> {
+    let n: u64 = products.iter().map(|color| color.n_seen).sum();
+    if n == 0 {
+        return Err(Error::NothingSeen);
+    }
+    let squares: u64 =
+        products.iter().map(|color| color.picture_picture + color.image_image - 2 * color.picture_image).sum();
+    let mean_square = squares as f64 / n as f64;
+    Ok(10.0 * (255.0_f64.powi(2) / mean_square).log10())
+}
+
 impl SplatTrainer {
+    /// PSNR of the picture that people see of a view against the image of a keyframe of its size; `None` before learning has
+    /// begun.
+    pub(super) fn psnr_of_view(
+        &mut self,
+        camera: &Camera,
+        background_srgb: [f32; 3],
+        keyframe: &Keyframe,
+    ) -> Result<Option<f64>, Error> {
+        let Learn::Ready(learn) = &self.learn else { return Ok(None) };
+        let learn = learn.clone();
+        let rgba = keyframe.rgba_srgb.as_ref();
+        if rgba.len() != 4 * camera.size_px[0] as usize * camera.size_px[1] as usize {
+            return Ok(None);
+        }
+        let image = match self.compared.take() {
+            Some(image) if image.bytes() >= rgba.len() as u64 => {
+                self.gpu.write(&image, 0, rgba);
+                image
+            }
+            _ => {
+                self.passes.forget_bindings();
+                self.gpu.storage_with("splat.compared", rgba)?
+            }
+        };
+        let wanted = Wanted::Comparison { score: &learn.score, image: &image };
+        let take = |parts: &[&[u8]]| sum_up(&bytemuck::pod_collect_to_vec::<u8, [u32; 4]>(parts[0]));
+        let products = self.draw_reading(camera, background_srgb, true, wanted, take)?;
+        self.compared = Some(image);
+        psnr_as_evaluated(&products).map(Some)
+    }
+
     /// PSNR of keyframes that were not learned from, dB; of many, some spread over them.
-    pub(super) fn score_held_back(&mut self) -> Result<Vec<f64>, Error> {
-        let products = self.compare_held_back()?;
-        Ok(products.iter().filter_map(|(_, products)| psnr_with(products, [1.0; 3])).collect())
+    pub(super) fn score_held_back(&mut self) -> Result<Scores, Error> {
+        let score = |(keyframe, products): &Compared| {
+            Some(((keyframe.camera.clone(), keyframe.stamp), psnr_with(products, [1.0; 3])?))
+        };
+        Ok(self.compare_held_back()?.iter().filter_map(score).collect())
     }
 
     /// Scores the held-back keyframes as they are, and with the gains of the images before and after them in time; decides
@@ -59,13 +131,8 @@ impl SplatTrainer {
         let held_back = self.compare_held_back()?;
         let fixes = self.learned_fixes()?;
         let neighbors: Vec<Vec<usize>> = held_back.iter().map(|(keyframe, _)| self.neighbors(keyframe)).collect();
-        self.make_levels(neighbors.iter().flatten().map(|view_ix| (*view_ix, 0)).collect())?;
         let mut known: BTreeMap<usize, [f64; 3]> = BTreeMap::new();
-        for view_ix in neighbors.iter().flatten() {
-            if !known.contains_key(view_ix) {
-                known.insert(*view_ix, self.gains_of(*view_ix, &fixes)?);
-            }
-        }
+        self.add_gains(&mut known, neighbors.iter().flatten().copied().collect(), &fixes)?;
         // What all images ask for is the brightness of the model, not of an image.
         let mean = |color: usize| known.values().map(|gains| gains[color]).sum::<f64>() / known.len().max(1) as f64;
         let mean = [0, 1, 2].map(mean);
@@ -84,13 +151,9 @@ impl SplatTrainer {
         if let Some(gains) = self.trials.end_gains(&without_db, &with_db) {
             self.cameras.learn_also(gains);
             self.begin_learning()?;
-            self.make_levels((0..self.views.len()).map(|view_ix| (view_ix, 0)).collect())?;
-            for view_ix in 0..self.views.len() {
-                let gains = match known.get(&view_ix) {
-                    Some(gains) => *gains,
-                    None => self.gains_of(view_ix, &fixes)?,
-                };
-                let keyframe = &self.views[view_ix].keyframe;
+            self.add_gains(&mut known, (0..self.views.len()).collect(), &fixes)?;
+            for (view_ix, gains) in &known {
+                let keyframe = &self.views[*view_ix].keyframe;
                 self.cameras.begin_gains(&self.gpu, keyframe, [0, 1, 2].map(|color| gains[color] - mean[color]));
             }
         }
@@ -107,28 +170,48 @@ impl SplatTrainer {
         before.into_iter().chain(after).map(|(ix, _)| ix).collect()
     }
 
+    /// Adds the gains of these views that are not known.
+    fn add_gains(
+        &mut self,
+        known: &mut BTreeMap<usize, [f64; 3]>,
+        view_ixs: BTreeSet<usize>,
+        fixes: &Fixes,
+    ) -> Result<(), Error> {
+        let unknown: Vec<usize> = view_ixs.into_iter().filter(|view_ix| !known.contains_key(view_ix)).collect();
+        for some in unknown.chunks(VIEWS_AT_ONCE) {
+            self.make_levels(&some.iter().map(|view_ix| (*view_ix, 0)).collect())?;
+            for view_ix in some {
+                known.insert(*view_ix, self.gains_of(*view_ix, fixes)?);
+            }
+        }
+        Ok(())
+    }
+
+    /// The gains that bring the picture of a view nearest to its image, which is on the GPU.
     fn gains_of(&mut self, view_ix: usize, fixes: &Fixes) -> Result<[f64; 3], Error> {
         let keyframe = self.views[view_ix].keyframe.clone();
         self.draw_keyframe(&keyframe, fixes)?;
-        let image = &self.views[view_ix].level(&self.gpu, 0)?.image;
+        let (_, Level { image, .. }) = self.views[view_ix].made(0)?;
         let drawn = Drawn::of(&self.gpu, &self.learn, &self.draw_frame, &self.draw_view)?;
         Ok(log_gains(&drawn.compare(&mut self.passes, &keyframe, image)?))
     }
 
     fn compare_held_back(&mut self) -> Result<Vec<Compared>, Error> {
         let fixes = self.learned_fixes()?;
-        let stride = self.trials.held_back.len().div_ceil(MOST_SCORED).max(1);
         let mut compared = Vec::new();
-        for ix in (0..self.trials.held_back.len()).step_by(stride) {
-            let keyframe = self.trials.held_back[ix].keyframe.clone();
+        for id in self.trials.scored() {
+            let Some(held_back) = self.trials.held_back(&id) else { continue }; // Evicted since.
+            let (keyframe, image) = (held_back.keyframe.clone(), held_back.image.take());
             self.draw_keyframe(&keyframe, &fixes)?;
-            let image = match self.trials.held_back[ix].image.take() {
+            let image = match image {
                 Some(image) => image,
                 None => self.gpu.storage_with("splat.held_back", &keyframe.rgba_srgb)?,
             };
             let drawn = Drawn::of(&self.gpu, &self.learn, &self.draw_frame, &self.draw_view)?;
             let products = drawn.compare(&mut self.passes, &keyframe, &image)?;
-            self.trials.held_back[ix].image = Some(image);
+            if let Some(held_back) = self.trials.held_back(&id) {
+                held_back.image = Some(image);
+            }
             compared.push((keyframe, products));
         }
         Ok(compared)
@@ -165,23 +248,9 @@ impl<'a> Drawn<'a> {
 
     /// Sums over the pixels of it and of the image that it shows.
     fn compare(&self, passes: &mut Passes, keyframe: &Keyframe, image: &Buffer) -> Result<[Products; 3], Error> {
-        let n_groups = (keyframe.size_px[0] * keyframe.size_px[1]).div_ceil(256);
-        let buffers = [
-            ("view", self.view),
-            ("pixels", &self.frame.pixels),
-            ("target_image", image),
-            ("products", &self.frame.products),
-        ];
-        passes.dispatch(self.gpu, self.score, n_groups.into(), &buffers);
-        passes.submit(self.gpu);
-        let sums: Vec<[u32; 4]> = self.gpu.read(&self.frame.products, 3 * n_groups as usize)?;
-        let sum = |color: usize, part: usize| sums.iter().skip(color).step_by(3).map(|of| u64::from(of[part])).sum();
-        Ok([0, 1, 2].map(|color| Products {
-            picture_picture: sum(color, 0),
-            picture_image: sum(color, 1),
-            image_image: sum(color, 2),
-            n_seen: sum(color, 3),
-        }))
+        let n_groups = compare(self.gpu, passes, self.score, (self.view, self.frame), keyframe.size_px, image);
+        let read = passes.submit_reading(self.gpu, &[(&self.frame.products, PRODUCTS_BYTES * n_groups as usize)]);
+        Ok(sum_up(&read.finish(self.gpu)?))
     }
 }
 
@@ -214,11 +283,43 @@ mod tests {
         let held_back: Vec<_> = keyframes.iter().filter(|keyframe| keyframe.split == Split::Selection).collect();
         let scores = trainer.score_held_back().unwrap();
         assert_eq!(scores.len(), held_back.len());
-        for (score, keyframe) in scores.iter().zip(held_back) {
+        for ((id, score), keyframe) in scores.iter().zip(held_back) {
+            assert_eq!(id.1, keyframe.stamp);
             let picture = trainer.render(&request(keyframe.world_from_camera)).unwrap();
             let pair = PixelPair::new(keyframe.size_px, &picture.rgba_srgb, &keyframe.rgba_srgb).unwrap();
             assert!((psnr(&pair).unwrap() - score).abs() < 1e-9);
         }
+    }
+
+    #[test]
+    fn scores_computed_on_the_gpu_are_those_of_pictures_to_the_last_bit() {
+        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let keyframes = n_keyframes(&gpu, 5, true);
+        let asked = |keyframe: &Keyframe| request(keyframe.world_from_camera);
+        let mut trainer = SplatTrainer::new(gpu, options()).unwrap();
+        trainer.push(keyframes[1].clone()).unwrap();
+        train(&mut trainer, 20);
+        // An image with a mask at the edge of a workgroup, and whole ones after it in the same buffer.
+        let mut rgba = keyframes[0].rgba_srgb.to_vec();
+        rgba.as_chunks_mut::<4>().0[250..900].iter_mut().for_each(|pixel| pixel[3] = 0);
+        let masked = Keyframe { rgba_srgb: rgba.into(), ..keyframes[0].as_ref().clone() };
+        for keyframe in [&masked, &keyframes[0], &keyframes[3]] {
+            let picture = trainer.render(&asked(keyframe)).unwrap();
+            let pair = PixelPair::new(keyframe.size_px, &picture.rgba_srgb, &keyframe.rgba_srgb).unwrap();
+            assert_eq!(trainer.psnr(&asked(keyframe), keyframe).unwrap(), Some(psnr(&pair).unwrap()));
+        }
+        // A picture equals itself.
+        let picture = trainer.render(&asked(&keyframes[0])).unwrap();
+        let mut rgba = picture.rgba_srgb;
+        rgba.as_chunks_mut::<4>().0.iter_mut().for_each(|pixel| pixel[3] = 255);
+        let same = Keyframe { rgba_srgb: rgba.into(), ..keyframes[0].as_ref().clone() };
+        assert_eq!(trainer.psnr(&asked(&same), &same).unwrap(), Some(f64::INFINITY));
+        let unseen = Keyframe { rgba_srgb: vec![0; same.rgba_srgb.len()].into(), ..same.clone() };
+        assert!(matches!(trainer.psnr(&asked(&same), &unseen), Err(Error::NothingSeen)));
+        let small = crate::RenderRequest { size_px: [8, 8], ..asked(&same) };
+        assert_eq!(trainer.psnr(&small, &same).unwrap(), None, "another size");
+        let mut loaded = SplatTrainer::from_arrays(trainer.gpu.clone(), options(), &trainer.arrays().unwrap()).unwrap();
+        assert_eq!(loaded.psnr(&asked(&same), &same).unwrap(), None, "what learning needs is not compiled");
     }
 
     /// From the middle of the capture on the images are darker by a stop.

@@ -1,6 +1,6 @@
 //! How large the model has to be: what each splat contributes, what remains without the least of them, what colors need.
 
-use super::{LearnedView, SplatTrainer};
+use super::{LearnedView, SplatTrainer, VIEWS_AT_ONCE};
 use crate::Error;
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::kernels::LearnPipelines;
@@ -15,16 +15,19 @@ impl SplatTrainer {
         let contributions = self.gpu.storage("splat.contributions", 4 * u64::from(self.splats.n_splats))?;
         let stride = self.views.len().div_ceil(MOST_VIEWS).max(1);
         let some: Vec<usize> = (0..self.views.len()).step_by(stride).collect();
-        self.make_levels(some.iter().map(|view_ix| (*view_ix, 0)).collect())?;
         for view_ix in &some {
-            self.make_ready(*view_ix, 0)?;
+            self.make_space(*view_ix, 0)?;
         }
         if let Some(frame) = &self.learn_frame {
             // An error of one in every pixel, and no slope.
             self.gpu.write(&frame.rest, 0, bytemuck::cast_slice(&[0.0f32, 1.0].repeat(frame.n_pixels as usize)));
             self.passes.clear(&frame.upstream);
         }
-        for view_ix in some {
+        for (ix, view_ix) in some.iter().copied().enumerate() {
+            if ix % VIEWS_AT_ONCE == 0 {
+                let next = some[ix..].iter().take(VIEWS_AT_ONCE);
+                self.make_levels(&next.map(|view_ix| (*view_ix, 0)).collect())?;
+            }
             loop {
                 let mut list = std::mem::take(&mut self.passes);
                 let LearnedView { view, .. } = self.learned_view(&mut list, learn, (view_ix, 0))?;
@@ -232,11 +235,11 @@ mod tests {
         let before = trainer.render(&view).unwrap();
         let n_before = trainer.progress().primitives;
         let instead = trainer.state().unwrap();
-        trainer.trials.turn(instead, Vec::new());
+        trainer.trials.turn(instead, super::super::super::trials::Scores::new());
         trainer.keep_most(50).unwrap();
         assert_eq!(trainer.progress().primitives, n_before);
         assert!(trainer.render(&view).unwrap().rgba_srgb == before.rgba_srgb);
-        let instead = trainer.trials.give_up().unwrap();
+        let instead = trainer.trials.give_up().unwrap().restored.unwrap();
         trainer.go_back(instead).unwrap();
         assert!(trainer.render(&view).unwrap().rgba_srgb == before.rgba_srgb);
     }

@@ -1,8 +1,9 @@
 //! Meshes as `.glb`: glTF 2.0 (Khronos 2021), one JSON and one binary chunk.
 
 use super::Mesh;
-use crate::Error;
+use crate::{Error, whole_file};
 use serde_json::json;
+use std::io::Write;
 use std::path::Path;
 
 const MAGIC: u32 = 0x4654_6c67;
@@ -15,7 +16,7 @@ const INDICES: u32 = 34_963;
 
 /// Writes a mesh. glTF has y up and z towards the viewer, the world has z up: a node turns it; another holds the origin.
 pub fn write(path: &Path, mesh: &Mesh) -> Result<(), Error> {
-    std::fs::write(path, to_bytes(mesh)).map_err(|source| Error::Write { path: path.to_owned(), source })
+    whole_file::write(path, |file| file.write_all(&to_bytes(mesh)))
 }
 
 /// The file.

@@ -1,8 +1,7 @@
 //! Meshes as binary `.ply` (Turk 1994), as other programs read it.
 
 use super::Mesh;
-use crate::Error;
-use std::fs::File;
+use crate::{Error, whole_file};
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
@@ -11,12 +10,11 @@ const FAR_M: f64 = 1000.0;
 
 /// Writes a mesh in world metres.
 pub fn write(path: &Path, mesh: &Mesh) -> Result<(), Error> {
-    let written = File::create(path).and_then(|file| {
+    whole_file::write(path, |file| {
         let mut file = BufWriter::new(file);
         write_to(&mut file, mesh)?;
         file.flush()
-    });
-    written.map_err(|source| Error::Write { path: path.to_owned(), source })
+    })
 }
 
 pub(super) fn write_to(file: &mut impl Write, mesh: &Mesh) -> std::io::Result<()> {

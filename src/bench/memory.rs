@@ -1,0 +1,188 @@
+//! Memory of this process over time, and how fast it grows once everything that is bounded is full.
+
+use super::statistics::{median, slope};
+use anyhow::{Context, anyhow};
+use serde::Serialize;
+
+/// After the keyframe store is full, this long does not count: buffers take on their sizes.
+const SETTLE_SECS: f64 = 60.0;
+/// Least length of what a rate is measured over.
+const MIN_SPAN_SECS: f64 = 60.0;
+/// Samples that a rate is measured with; more are thinned to medians of as many groups.
+const MAX_GROUPS: usize = 400;
+const SECS_PER_HOUR: f64 = 3600.0;
+
+/// Memory at one moment, bytes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub(crate) struct Sample {
+    /// Since the first image.
+    pub(crate) seconds: f64,
+    /// Of the process; on a software adapter with the GPU's.
+    pub(crate) resident_bytes: u64,
+    /// Live GPU buffers.
+    pub(crate) gpu_bytes: u64,
+    /// What the GPU's allocator holds for them, where the backend reports it.
+    pub(crate) gpu_reserved_bytes: Option<u64>,
+    /// Of the models, a part of `gpu_bytes`.
+    pub(crate) model_bytes: u64,
+    /// Images of keyframes on the GPU, a part of `gpu_bytes`.
+    pub(crate) gpu_image_bytes: u64,
+    /// Host memory of the keyframes held.
+    pub(crate) keyframe_bytes: u64,
+    pub(crate) keyframes: usize,
+    /// Keyframes that made room for others.
+    pub(crate) evicted: u64,
+    pub(crate) step: u64,
+    /// Connected viewers, and the pictures they got.
+    pub(crate) viewers: usize,
+    pub(crate) pictures: u64,
+}
+
+/// Which part of resident memory is measured.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Beyond {
+    /// All of it: GPU buffers lie elsewhere.
+    Nothing,
+    /// What is not the models' own.
+    Model,
+    /// What is neither the models' nor working memory of training, whose size goes with the models'.
+    Training,
+}
+
+impl Beyond {
+    fn bytes(self, sample: &Sample) -> f64 {
+        let taken_off = match self {
+            Self::Nothing => 0,
+            Self::Model => sample.model_bytes,
+            Self::Training => sample.gpu_bytes.saturating_sub(sample.gpu_image_bytes),
+        };
+        sample.resident_bytes as f64 - taken_off as f64
+    }
+}
+
+/// How fast memory grows once the keyframe store is full.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub(crate) struct Growth {
+    /// Whether the store was full; else the second half of the run is measured.
+    pub(crate) store_was_full: bool,
+    /// What is measured, seconds since the first image.
+    pub(crate) from_seconds: f64,
+    pub(crate) to_seconds: f64,
+    /// Median resident memory in that time.
+    pub(crate) resident_bytes: f64,
+    /// By the median of the slopes between all pairs of samples.
+    pub(crate) bytes_per_hour: f64,
+    /// The same as a share of `resident_bytes`.
+    pub(crate) percent_per_hour: f64,
+}
+
+impl Growth {
+    /// `None` where what counts is shorter than a minute.
+    pub(crate) fn of(samples: &[Sample], beyond: Beyond) -> Option<Self> {
+        let full_at = samples.iter().find(|sample| sample.evicted > 0).map(|sample| sample.seconds + SETTLE_SECS);
+        let last = samples.last()?;
+        let from_seconds = full_at.unwrap_or(0.5 * last.seconds);
+        let counted: Vec<&Sample> = samples.iter().filter(|sample| sample.seconds >= from_seconds).collect();
+        if last.seconds - counted.first()?.seconds < MIN_SPAN_SECS {
+            return None;
+        }
+        let of_group = |group: &[&Sample]| {
+            let seconds: Vec<f64> = group.iter().map(|sample| sample.seconds).collect();
+            let bytes: Vec<f64> = group.iter().map(|sample| beyond.bytes(sample)).collect();
+            median(&seconds).zip(median(&bytes))
+        };
+        let groups: Vec<(f64, f64)> = counted.chunks(counted.len().div_ceil(MAX_GROUPS)).filter_map(of_group).collect();
+        let resident: Vec<f64> = counted.iter().map(|sample| sample.resident_bytes as f64).collect();
+        let (resident_bytes, bytes_per_hour) = (median(&resident)?, slope(&groups)? * SECS_PER_HOUR);
+        Some(Self {
+            store_was_full: full_at.is_some(),
+            from_seconds: counted.first()?.seconds,
+            to_seconds: last.seconds,
+            resident_bytes,
+            bytes_per_hour,
+            percent_per_hour: 100.0 * bytes_per_hour / resident_bytes,
+        })
+    }
+}
+
+/// Resident memory of this process now and at most, bytes.
+pub(crate) fn resident_bytes() -> anyhow::Result<(u64, u64)> {
+    const STATUS: &str = "/proc/self/status";
+    let status = std::fs::read_to_string(STATUS)
+        .with_context(|| format!("cannot read {STATUS}: resident memory is measured on Linux only"))?;
+    let now = kilobytes(&status, "VmRSS:").ok_or_else(|| anyhow!("{STATUS} has no line VmRSS"))?;
+    let peak = kilobytes(&status, "VmHWM:").ok_or_else(|| anyhow!("{STATUS} has no line VmHWM"))?;
+    Ok((now << 10, peak << 10))
+}
+
+fn kilobytes(status: &str, name: &str) -> Option<u64> {
+    status.lines().find_map(|line| line.strip_prefix(name))?.trim().strip_suffix("kB")?.trim().parse().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A store that is full after 100 s, and `bytes` after so many seconds.
+    fn samples(n: u32, bytes: impl Fn(f64) -> f64) -> Vec<Sample> {
+        let sample = |ix: u32| {
+            let seconds = f64::from(ix);
+            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "small numbers")]
+            let resident_bytes = bytes(seconds) as u64;
+            Sample { seconds, resident_bytes, evicted: u64::from(ix >= 100), ..Sample::default() }
+        };
+        (0..n).map(sample).collect()
+    }
+
+    #[test]
+    fn growth_counts_from_the_full_store_on_and_jumps_do_not_move_it() {
+        let growing = |seconds: f64| {
+            let jump = if (1000.0..1010.0).contains(&seconds) { 5e8 } else { 0.0 };
+            if seconds < 150.0 { 1e7 * seconds } else { 2e9 + 1e8 * seconds / 3600.0 + jump }
+        };
+        let growth = Growth::of(&samples(3600, growing), Beyond::Model).expect("an hour");
+        assert!(growth.store_was_full && growth.from_seconds == 160.0 && growth.to_seconds == 3599.0, "{growth:?}");
+        assert!((growth.bytes_per_hour - 1e8).abs() < 1e6, "{growth:?}");
+        assert!((growth.percent_per_hour - 4.9).abs() < 0.1, "{growth:?}");
+    }
+
+    #[test]
+    fn bytes_of_models_and_training_are_no_growth() {
+        let mut with_model = samples(600, |seconds| 1e9 + 1e6 * seconds);
+        for sample in &mut with_model {
+            sample.model_bytes = sample.resident_bytes - 1_000_000_000;
+        }
+        let rate = |samples: &[Sample], beyond| Growth::of(samples, beyond).expect("long enough").bytes_per_hour;
+        assert!(rate(&with_model, Beyond::Model).abs() < 1.0);
+        assert!((rate(&with_model, Beyond::Nothing) - 3.6e9).abs() < 1e6);
+        for sample in &mut with_model {
+            (sample.gpu_bytes, sample.model_bytes) = (sample.model_bytes + 5_000_000, 0);
+            sample.gpu_image_bytes = 5_000_000;
+        }
+        assert!(rate(&with_model, Beyond::Training).abs() < 1.0);
+    }
+
+    #[test]
+    fn a_store_that_is_never_full_leaves_the_second_half() {
+        let mut never_full = samples(400, |_| 1e9);
+        never_full.iter_mut().for_each(|sample| sample.evicted = 0);
+        let growth = Growth::of(&never_full, Beyond::Model).expect("long enough");
+        assert!(!growth.store_was_full && growth.from_seconds == 200.0, "{growth:?}");
+        assert_eq!(
+            Growth::of(&samples(200, |_| 1e9), Beyond::Model),
+            None,
+            "40 s after the store was full and settled"
+        );
+        assert_eq!(Growth::of(&[], Beyond::Model), None);
+    }
+
+    #[test]
+    fn memory_of_this_process_is_read() {
+        let (before, _) = resident_bytes().expect("Linux");
+        let held = vec![1u8; 64 << 20];
+        let (now, peak) = resident_bytes().expect("Linux");
+        assert!(now >= before + (48 << 20) && peak >= now, "{before} {now} {peak} {}", held.len());
+        assert_eq!(kilobytes("VmHWM:\t  2048 kB\nVmRSS:\t  1024 kB\n", "VmRSS:"), Some(1024));
+        assert_eq!(kilobytes("VmRSS: some", "VmRSS:"), None);
+    }
+}

@@ -1,0 +1,276 @@
+//! A viewer of the page, for benches: a WebSocket client that asks for one picture after another and keeps none.
+//!
+//! It runs in the process that it measures, so it reads through one small buffer.
+
+use anyhow::{Context, bail, ensure};
+use kinematics::Transform;
+use nalgebra::{Point3, Vector3};
+use serde_json::{Value, json};
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{Shutdown, SocketAddr, TcpStream};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+/// Size of the pictures it asks for, pixels.
+const SIZE_PX: [u32; 2] = [960, 720];
+/// Angle between two pictures as it circles the scene, radians.
+const TURN_RAD: f64 = 0.05;
+/// The server is taken for dead after this long without a byte: it sends its status several times a second.
+const MAX_SILENCE: Duration = Duration::from_secs(120);
+/// Longest text message that is read: the list of keyframes.
+const MAX_TEXT_BYTES: u64 = 16 << 20;
+/// Longest header of a binary message.
+const MAX_HEADER_BYTES: u64 = 64 << 10;
+
+const TEXT: u8 = 1;
+const BINARY: u8 = 2;
+const CLOSE: u8 = 8;
+const PING: u8 = 9;
+const PONG: u8 = 10;
+
+/// A connected viewer; it disconnects when dropped.
+#[derive(Debug)]
+pub(crate) struct Viewer {
+    stream: TcpStream,
+    n_pictures: Arc<AtomicU64>,
+    thread: Option<JoinHandle<anyhow::Result<()>>>,
+}
+
+impl Viewer {
+    /// Connects to a server of this machine and starts to ask for pictures.
+    pub(crate) fn connect(address: SocketAddr) -> anyhow::Result<Self> {
+        let stream = TcpStream::connect(address).with_context(|| format!("cannot connect to {address}"))?;
+        stream.set_read_timeout(Some(MAX_SILENCE)).context("cannot set a timeout")?;
+        let n_pictures = Arc::new(AtomicU64::new(0));
+        let mut client = Client {
+            reader: BufReader::new(stream.try_clone().context("cannot share a connection")?),
+            stream: stream.try_clone().context("cannot share a connection")?,
+            n_pictures: n_pictures.clone(),
+            n_asked: 0,
+            center_m: Point3::origin(),
+            radius_m: 1.0,
+        };
+        client.shake_hands(address)?;
+        let thread = std::thread::Builder::new().name("viewer".into()).spawn(move || client.run());
+        Ok(Self { stream, n_pictures, thread: Some(thread.context("cannot start a thread")?) })
+    }
+
+    /// Full pictures received so far.
+    pub(crate) fn n_pictures(&self) -> u64 {
+        self.n_pictures.load(Ordering::Relaxed)
+    }
+
+    /// Whether it still receives.
+    pub(crate) fn is_connected(&self) -> bool {
+        self.thread.as_ref().is_some_and(|thread| !thread.is_finished())
+    }
+}
+
+impl Drop for Viewer {
+    fn drop(&mut self) {
+        // Fails where the server was faster.
+        let _ = self.stream.shutdown(Shutdown::Both);
+        if let Some(Ok(Err(error))) = self.thread.take().map(JoinHandle::join) {
+            log::debug!("a viewer ended: {error:#}");
+        }
+    }
+}
+
+struct Client {
+    reader: BufReader<TcpStream>,
+    stream: TcpStream,
+    n_pictures: Arc<AtomicU64>,
+    n_asked: u64,
+    /// Of the scene, in world.
+    center_m: Point3<f64>,
+    radius_m: f64,
+}
+
+impl Client {
+    fn shake_hands(&mut self, address: SocketAddr) -> anyhow::Result<()> {
+        write!(
+            self.stream,
+            "GET /ws HTTP/1.1\r\nHost: {address}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n\
+             Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+        )?;
+        let mut line = String::new();
+        self.reader.read_line(&mut line)?;
+        ensure!(line.starts_with("HTTP/1.1 101"), "the server answered {:?} in place of a WebSocket", line.trim_end());
+        while line.trim_end() != "" {
+            line.clear();
+            ensure!(self.reader.read_line(&mut line)? > 0, "the server closed the connection");
+        }
+        Ok(())
+    }
+
+    fn run(mut self) -> anyhow::Result<()> {
+        self.ask()?;
+        loop {
+            let (kind, n_bytes) = self.next_frame()?;
+            match kind {
+                TEXT => self.take_text(n_bytes)?,
+                BINARY => self.take_binary(n_bytes)?,
+                PING => {
+                    let mut contents = vec![0; usize::try_from(n_bytes.min(125))?];
+                    self.reader.read_exact(&mut contents)?;
+                    self.send(PONG, &contents)?;
+                }
+                CLOSE => return Ok(()),
+                _ => self.skip(n_bytes)?,
+            }
+        }
+    }
+
+    fn take_text(&mut self, n_bytes: u64) -> anyhow::Result<()> {
+        ensure!(n_bytes <= MAX_TEXT_BYTES, "a text message of {n_bytes} bytes, expected at most {MAX_TEXT_BYTES}");
+        let message: Value = serde_json::from_reader((&mut self.reader).take(n_bytes))?;
+        match message["type"].as_str() {
+            Some("scene") => {
+                let number = |value: &Value| value.as_f64().context("a scene without its numbers");
+                let center = &message["center_m"];
+                self.center_m = Point3::new(number(&center[0])?, number(&center[1])?, number(&center[2])?);
+                self.radius_m = number(&message["radius_m"])?;
+            }
+            // Nothing was seen yet.
+            Some("error") => {
+                std::thread::sleep(Duration::from_millis(200));
+                self.ask()?;
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn take_binary(&mut self, n_bytes: u64) -> anyhow::Result<()> {
+        let mut length = [0; 4];
+        self.reader.read_exact(&mut length)?;
+        let n_header = u64::from(u32::from_le_bytes(length));
+        ensure!(n_header <= n_bytes.saturating_sub(4).min(MAX_HEADER_BYTES), "a header of {n_header} bytes");
+        let header: Value = serde_json::from_reader((&mut self.reader).take(n_header))?;
+        self.skip(n_bytes - 4 - n_header)?;
+        if header["type"] == "picture" && header["last"] == true {
+            self.n_pictures.fetch_add(1, Ordering::Relaxed);
+            self.ask()?;
+        }
+        Ok(())
+    }
+
+    /// Asks for the next picture on a circle around the scene.
+    fn ask(&mut self) -> anyhow::Result<()> {
+        let angle = self.n_asked as f64 * TURN_RAD;
+        let away = Vector3::new(angle.cos(), angle.sin(), 0.7) * 1.5 * self.radius_m;
+        // `face_towards` has z forward and turns y up: a camera's y points down.
+        let world_from_camera = Transform::face_towards(&(self.center_m + away), &self.center_m, &-Vector3::z());
+        let order = json!({
+            "type": "render",
+            "id": self.n_asked,
+            "world_from_camera": world_from_camera.to_homogeneous().transpose().as_slice(),
+            "size_px": SIZE_PX,
+            "projection": { "kind": "pinhole", "vertical_fov_rad": 0.9 },
+            "outputs": ["color", "depth"],
+        });
+        self.n_asked += 1;
+        self.send(TEXT, order.to_string().as_bytes())
+    }
+
+    /// Kind and length of the next frame; the server sends each message as one.
+    fn next_frame(&mut self) -> anyhow::Result<(u8, u64)> {
+        let mut head = [0; 2];
+        self.reader.read_exact(&mut head)?;
+        let is_whole = head[0] & 0x80 != 0;
+        ensure!(is_whole, "the server sent a message in pieces, expected whole ones");
+        let n_bytes = match head[1] {
+            126 => {
+                let mut bytes = [0; 2];
+                self.reader.read_exact(&mut bytes)?;
+                u64::from(u16::from_be_bytes(bytes))
+            }
+            127 => {
+                let mut bytes = [0; 8];
+                self.reader.read_exact(&mut bytes)?;
+                u64::from_be_bytes(bytes)
+            }
+            short @ 0..126 => u64::from(short),
+            masked => bail!("the server sent a masked frame (length byte {masked})"),
+        };
+        Ok((head[0] & 0x0f, n_bytes))
+    }
+
+    fn skip(&mut self, n_bytes: u64) -> anyhow::Result<()> {
+        let n_skipped = std::io::copy(&mut (&mut self.reader).take(n_bytes), &mut std::io::sink())?;
+        ensure!(n_skipped == n_bytes, "the server closed the connection within a message");
+        Ok(())
+    }
+
+    /// Sends a frame. Its mask is zero: the server must unmask, and nothing on loopback has to be kept from guessing bytes.
+    fn send(&mut self, kind: u8, contents: &[u8]) -> anyhow::Result<()> {
+        let mut frame = vec![0x80 | kind];
+        match u8::try_from(contents.len()) {
+            Ok(n @ 0..126) => frame.push(0x80 | n),
+            _ => {
+                frame.push(0x80 | 126);
+                frame.extend(u16::try_from(contents.len())?.to_be_bytes());
+            }
+        }
+        frame.extend([0; 4]);
+        frame.extend(contents);
+        Ok(self.stream.write_all(&frame)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::time::Instant;
+    use trainer::Picture;
+    use viz::{Hub, Server, ServerConfig};
+
+    #[test]
+    fn a_viewer_is_served_and_leaves() {
+        let hub = Hub::new();
+        let listen = "127.0.0.1:0".parse().expect("an address");
+        let server = Server::start(ServerConfig { listen }, hub.clone()).expect("a free port");
+        let viewer = Viewer::connect(server.address()).expect("served");
+        let begun = Instant::now();
+        let mut n_drawn = 0;
+        while viewer.n_pictures() < 3 {
+            assert!(viewer.is_connected() && begun.elapsed() < Duration::from_secs(60), "{}", viewer.n_pictures());
+            let Some(pending) = hub.next_request() else {
+                std::thread::sleep(Duration::from_millis(1));
+                continue;
+            };
+            if n_drawn == 0 {
+                // It asks again.
+                pending.fail("nothing was seen yet");
+            } else {
+                let size_px = pending.request.size_px;
+                let n = (size_px[0] * size_px[1]) as usize;
+                pending.deliver(Picture { size_px, rgba_srgb: vec![128; 4 * n], depth_m: vec![1.0; n] });
+            }
+            n_drawn += 1;
+        }
+        assert!(n_drawn >= 4, "one that failed and three pictures, of one stage each where the server draws fast");
+        drop(viewer);
+        while hub.n_clients() > 0 {
+            assert!(begun.elapsed() < Duration::from_secs(60));
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    #[test]
+    fn what_is_no_server_is_refused() {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
+        let address = listener.local_addr().expect("bound");
+        let other = std::thread::spawn(move || {
+            let (mut stream, _) = listener.accept().expect("a client");
+            let n_read = stream.read(&mut [0; 4096]).expect("a request");
+            assert!(n_read > 0);
+            stream.write_all(b"HTTP/1.1 404 Not Found\r\n\r\n").expect("sent");
+        });
+        let refused = Viewer::connect(address).expect_err("no WebSocket").to_string();
+        assert!(refused.contains("404"), "{refused}");
+        other.join().expect("no panic");
+    }
+}

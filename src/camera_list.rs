@@ -1,0 +1,113 @@
+//! The cameras of a run's keyframes, in `cameras.json` beside the model: a viewer starts from them and draws them.
+
+use crate::camera_path;
+use anyhow::Context;
+use kinematics::Transform;
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+use viz::KeyframePose;
+
+/// Name of the file in the folder of a run.
+pub(crate) const FILE: &str = "cameras.json";
+
+/// Pose and lens of one keyframe.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct PosedCamera {
+    pub(crate) camera: String,
+    pub(crate) stamp_nanos: i64,
+    pub(crate) split: String,
+    pub(crate) size_px: [u32; 2],
+    pub(crate) focal_px: [f64; 2],
+    pub(crate) principal_px: [f64; 2],
+    /// 4x4 matrix, row major.
+    pub(crate) world_from_camera: [f64; 16],
+}
+
+#[derive(Serialize, Deserialize)]
+struct File {
+    cameras: Vec<PosedCamera>,
+}
+
+/// Writes the list, one camera a line.
+pub(crate) fn write(folder: &Path, cameras: &[PosedCamera]) -> anyhow::Result<()> {
+    let lines: Vec<String> = cameras.iter().map(serde_json::to_string).collect::<Result<_, _>>()?;
+    let path = folder.join(FILE);
+    let text = format!("{{\"cameras\": [\n{}\n]}}\n", lines.join(",\n"));
+    std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))
+}
+
+/// Reads the list; `None` where the folder has none.
+pub(crate) fn read(folder: &Path) -> anyhow::Result<Option<Vec<KeyframePose>>> {
+    let path = folder.join(FILE);
+    let text = match std::fs::read_to_string(&path) {
+        Ok(text) => text,
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+        Err(error) => return Err(error).with_context(|| format!("cannot read {}", path.display())),
+    };
+    let File { cameras } = serde_json::from_str(&text).with_context(|| format!("{} is damaged", path.display()))?;
+    let posed = cameras.into_iter().map(|camera| {
+        let world_from_camera = camera_path::rigid(&camera.world_from_camera).with_context(|| {
+            let (name, stamp) = (&camera.camera, camera.stamp_nanos);
+            format!("{}: the pose of {name} {stamp}", path.display())
+        })?;
+        Ok(KeyframePose {
+            camera: camera.camera.into(),
+            world_from_camera,
+            size_px: camera.size_px,
+            focal_px: camera.focal_px,
+            principal_px: camera.principal_px,
+        })
+    });
+    posed.collect::<anyhow::Result<_>>().map(Some)
+}
+
+/// The 4x4 matrix of a pose, row major.
+pub(crate) fn row_major(pose: &Transform) -> [f64; 16] {
+    let rows = pose.to_homogeneous().transpose();
+    std::array::from_fn(|ix| rows[ix])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{Isometry3, Vector3};
+
+    fn camera() -> PosedCamera {
+        let pose = Isometry3::new(Vector3::new(0.5, -2.0, 1.25), Vector3::new(0.3, -1.1, 0.7));
+        PosedCamera {
+            camera: "wrist".into(),
+            stamp_nanos: -7,
+            split: "test".into(),
+            size_px: [64, 48],
+            focal_px: [50.0, 51.0],
+            principal_px: [32.0, 24.0],
+            world_from_camera: row_major(&pose),
+        }
+    }
+
+    #[test]
+    fn cameras_are_read_as_they_were_written() {
+        let folder = tempfile::tempdir().expect("a folder");
+        assert!(read(folder.path()).expect("no file is no error").is_none());
+        write(folder.path(), &[camera(), camera()]).expect("room on the disk");
+        let cameras = read(folder.path()).expect("a list").expect("a file");
+        assert_eq!((cameras.len(), cameras[0].camera.as_ref(), cameras[1].size_px), (2, "wrist", [64, 48]));
+        for (number, expected) in row_major(&cameras[1].world_from_camera).iter().zip(camera().world_from_camera) {
+            assert!((number - expected).abs() < 1e-12);
+        }
+        write(folder.path(), &[]).expect("room on the disk");
+        assert_eq!(read(folder.path()).expect("a list").map(|cameras| cameras.len()), Some(0));
+    }
+
+    #[test]
+    fn a_damaged_list_is_an_error_that_names_the_file() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut skewed = camera();
+        skewed.world_from_camera[0] = 3.0;
+        write(folder.path(), &[skewed]).expect("room on the disk");
+        let message = format!("{:#}", read(folder.path()).expect_err("not rigid"));
+        assert!(message.contains(FILE) && message.contains("wrist -7"), "{message}");
+        std::fs::write(folder.path().join(FILE), "{").expect("room on the disk");
+        assert!(format!("{:#}", read(folder.path()).expect_err("cut off")).contains("damaged"));
+    }
+}

@@ -1,0 +1,388 @@
+//! `fieldrig bench memory`: resident memory of a long run, and how fast it grows once the keyframe store is full.
+
+use crate::bench::memory::{Beyond, Growth, Sample, resident_bytes};
+use crate::bench::page::{Findings, Table};
+use crate::bench::viewer::Viewer;
+use crate::chart::{Axis, Chart, Line, Point, Rule, Scale};
+use crate::commands::run::{self, Running};
+use crate::exit::{BadArgument, Exit};
+use crate::print;
+use crate::run_folder::MadeFolders;
+use anyhow::Context;
+use clap::Parser;
+use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// Longest time between two lines on stdout.
+const TELL_EVERY: Duration = Duration::from_secs(60);
+/// Charts and numbers are written this often: an interrupted bench shows what it has.
+const WRITE_EVERY: Duration = Duration::from_secs(60);
+/// Points of a line in the chart.
+const MAX_POINTS: usize = 60;
+/// Labels of GPU buffers that hold images of keyframes.
+const IMAGE_BUFFERS: [&str; 3] = ["splat.target_image", "splat.target_depth", "splat.held_back"];
+/// GPU buffers that the table lists, the largest first.
+const MAX_GPU_PARTS: usize = 12;
+const BYTES_PER_MB: f64 = 1e6;
+const SECS_PER_MINUTE: f64 = 60.0;
+
+/// Flags of `bench memory`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Cameras, arm and training settings (TOML)
+    rig_file: PathBuf,
+    /// Simulate the devices of the rig file, in real time
+    #[arg(long, conflicts_with = "from")]
+    sim: bool,
+    /// Replay a recording instead of live devices; training goes on after its end
+    #[arg(long, value_name = "RECORDING")]
+    from: Option<PathBuf>,
+    /// Length of the run, counted from the first image
+    #[arg(long, value_name = "S", default_value_t = 900.0)]
+    seconds: f64,
+    /// Time between two samples
+    #[arg(long, value_name = "S", default_value_t = 1.0)]
+    every_secs: f64,
+    /// Connected viewers that ask for one picture after another, 0 to 32
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(0..=32))]
+    viewers: u64,
+    /// Folder for charts and numbers
+    #[arg(long, value_name = "DIR", default_value = "bench-memory")]
+    out: PathBuf,
+    /// Print one JSON object a sample
+    #[arg(long)]
+    json: bool,
+    /// Further flags of `fieldrig run`
+    #[arg(last = true, value_name = "RUN FLAGS")]
+    run_flags: Vec<OsString>,
+}
+
+/// The flags of `run` as a command line of their own.
+#[derive(Debug, Parser)]
+struct RunFlags {
+    #[command(flatten)]
+    args: run::Args,
+}
+
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    args.check()?;
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}", args.out.display()))?;
+    // Checkpoints are a part of a run: they are written, and thrown away with their folder.
+    let run_folder = args.out.join(format!("run-{}", std::process::id()));
+    let measured = args.run_flags(&run_folder).and_then(|flags| measure(args, &flags));
+    if run_folder.exists() {
+        std::fs::remove_dir_all(&run_folder).with_context(|| format!("cannot remove {}", run_folder.display()))?;
+    }
+    let mut measured = measured?;
+    let findings = findings(args, &measured)?;
+    findings.tell(&findings.write(&args.out)?, args.json)?;
+    match measured.input_error.take() {
+        Some(error) => Err(anyhow::Error::new(error).context("the devices failed before the run was over")),
+        None => Ok(Exit::Done),
+    }
+}
+
+/// What a run was measured to take.
+#[derive(Debug, Default)]
+struct Measured {
+    /// Whether the GPU's memory is the host's.
+    is_software: bool,
+    samples: Vec<Sample>,
+    /// GPU buffers at the last sample, bytes by label.
+    gpu_parts: BTreeMap<Arc<str>, u64>,
+    /// Why the devices ended before the run did.
+    input_error: Option<drivers::Error>,
+}
+
+fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<Measured> {
+    let mut running = run::start(flags, None, &mut MadeFolders::default())?;
+    let address = running.server.address();
+    let viewers: Vec<Viewer> = (0..args.viewers).map(|_| Viewer::connect(address)).collect::<anyhow::Result<_>>()?;
+    let every = Duration::from_secs_f64(args.every_secs);
+    let mut measured = Measured { is_software: running.gpu.is_software(), ..Measured::default() };
+    let mut due = Instant::now();
+    let (mut told, mut written) = (None, Instant::now());
+    while running.take_turn()? {
+        let now = Instant::now();
+        if now < due {
+            continue;
+        }
+        due = now + every;
+        measured.gpu_parts = running.gpu.live_bytes_by_label();
+        let sample = sample(&running, &viewers, &measured.gpu_parts)?;
+        measured.samples.push(sample);
+        if args.json {
+            print::report_json(&serde_json::json!({ "event": "sample", "sample": sample }))?;
+        } else if told.is_none_or(|told: Instant| told.elapsed() >= TELL_EVERY) {
+            print::report(in_words(&sample));
+            told = Some(now);
+        }
+        if written.elapsed() >= WRITE_EVERY {
+            findings(args, &measured)?.write(&args.out)?;
+            written = Instant::now();
+        }
+    }
+    drop(viewers);
+    measured.input_error = running.discard()?;
+    Ok(measured)
+}
+
+fn sample(running: &Running, viewers: &[Viewer], gpu_parts: &BTreeMap<Arc<str>, u64>) -> anyhow::Result<Sample> {
+    let (live, gpu) = (&running.live, &running.gpu);
+    let sessions = live.sessions();
+    Ok(Sample {
+        seconds: sessions.first().map_or(0.0, |session| session.secs()),
+        resident_bytes: resident_bytes()?.0,
+        gpu_bytes: gpu.live_bytes(),
+        gpu_reserved_bytes: gpu.reserved_bytes(),
+        model_bytes: sessions.iter().map(|session| session.progress().bytes).sum(),
+        gpu_image_bytes: IMAGE_BUFFERS.iter().filter_map(|label| gpu_parts.get(*label)).sum(),
+        keyframe_bytes: live.keyframes().iter().map(|keyframe| keyframe.bytes()).sum(),
+        keyframes: live.keyframes().len(),
+        evicted: live.n_evicted(),
+        step: sessions.first().map_or(0, |session| session.progress().step),
+        viewers: viewers.iter().filter(|viewer| viewer.is_connected()).count(),
+        pictures: viewers.iter().map(Viewer::n_pictures).sum(),
+    })
+}
+
+fn in_words(sample: &Sample) -> String {
+    let mb = |bytes: u64| bytes as f64 / BYTES_PER_MB;
+    format!(
+        "{:7.1} s  {:8.1} MB resident  {:8.1} MB on the GPU  {:7.1} MB model  {:8.1} MB in {} keyframes, step {}",
+        sample.seconds,
+        mb(sample.resident_bytes),
+        mb(sample.gpu_bytes),
+        mb(sample.model_bytes),
+        mb(sample.keyframe_bytes),
+        sample.keyframes,
+        sample.step,
+    )
+}
+
+impl Args {
+    fn check(&self) -> Result<(), BadArgument> {
+        for (flag, value, allowed) in
+            [("--seconds", self.seconds, 1.0..=1e6), ("--every-secs", self.every_secs, 0.01..=3600.0)]
+        {
+            if !allowed.contains(&value) {
+                let (from, to) = (allowed.start(), allowed.end());
+                return Err(BadArgument(format!("{flag} {value}: must be a number from {from} to {to}")));
+            }
+        }
+        Ok(())
+    }
+
+    fn run_flags(&self, folder: &Path) -> anyhow::Result<run::Args> {
+        let mut line: Vec<OsString> = vec!["run".into(), self.rig_file.clone().into()];
+        if self.sim {
+            line.push("--sim".into());
+        }
+        if let Some(from) = &self.from {
+            line.extend(["--from".into(), from.into()]);
+        }
+        line.extend(["--seconds".into(), self.seconds.to_string().into()]);
+        line.extend(["--out".into(), folder.into()]);
+        line.extend(["--listen".into(), "127.0.0.1:0".into()]);
+        if self.json {
+            line.push("--json".into());
+        }
+        line.extend(self.run_flags.iter().cloned());
+        let flags = RunFlags::try_parse_from(line).map_err(|error| {
+            let message = error.to_string();
+            let first = message.lines().next().unwrap_or_default();
+            BadArgument(format!("flags of run: {}", first.strip_prefix("error: ").unwrap_or(first)))
+        })?;
+        Ok(flags.args)
+    }
+
+    fn input(&self) -> String {
+        match &self.from {
+            Some(recording) => recording.display().to_string(),
+            None => format!("{}{}", self.rig_file.display(), if self.sim { ", simulated" } else { "" }),
+        }
+    }
+}
+
+/// One of the things that take memory.
+struct Part {
+    label: &'static str,
+    bytes: fn(&Sample) -> Option<u64>,
+}
+
+const PARTS: [Part; 6] = [
+    Part { label: "resident", bytes: |sample| Some(sample.resident_bytes) },
+    Part { label: "GPU buffers", bytes: |sample| Some(sample.gpu_bytes) },
+    Part { label: "keyframes on the host", bytes: |sample| Some(sample.keyframe_bytes) },
+    Part { label: "model", bytes: |sample| Some(sample.model_bytes) },
+    Part { label: "images on the GPU", bytes: |sample| Some(sample.gpu_image_bytes) },
+    Part { label: "reserved for GPU buffers", bytes: |sample| sample.gpu_reserved_bytes },
+];
+
+/// Medians of groups of samples, and their extents.
+fn line(part: &Part, samples: &[Sample]) -> Line {
+    let of_group = |group: &[Sample]| {
+        let mut mb: Vec<f64> = group.iter().filter_map(part.bytes).map(|bytes| bytes as f64 / BYTES_PER_MB).collect();
+        mb.sort_by(f64::total_cmp);
+        let (low, high) = (*mb.first()?, *mb.last()?);
+        let x = group[group.len() / 2].seconds / SECS_PER_MINUTE;
+        Some(Point { x, y: mb[mb.len() / 2], low, high })
+    };
+    let n_each = samples.len().div_ceil(MAX_POINTS).max(1);
+    Line {
+        label: part.label.to_owned(),
+        points: samples.chunks(n_each).filter_map(of_group).collect(),
+        is_foreign: false,
+    }
+}
+
+fn findings(args: &Args, measured: &Measured) -> anyhow::Result<Findings> {
+    let samples = &measured.samples;
+    let growths: Vec<(&str, Growth)> = match measured.is_software {
+        true => vec![("beyond the model", Beyond::Model), ("beyond model and training buffers", Beyond::Training)],
+        false => vec![("of the host", Beyond::Nothing)],
+    }
+    .into_iter()
+    .filter_map(|(name, beyond)| Some((name, Growth::of(samples, beyond)?)))
+    .collect();
+    let rate = growths.first().map_or("too short for a rate".to_owned(), |(name, growth)| {
+        let since = if growth.store_was_full { "with a full keyframe store" } else { "in the second half" };
+        format!("{:+.2} % an hour {name} {since}", growth.percent_per_hour)
+    });
+    let conditions = format!("{}, {}", args.input(), print::counted(args.viewers, "viewer"));
+    let lines: Vec<Line> =
+        PARTS.iter().map(|part| line(part, samples)).filter(|line| !line.points.is_empty()).collect();
+    let full = samples.iter().find(|sample| sample.evicted > 0);
+    let rules = full.map(|sample| Rule {
+        x: sample.seconds / SECS_PER_MINUTE,
+        label: format!("store full: {} keyframes", sample.keyframes),
+        line_ix: 2,
+    });
+    let mut rows = Vec::new();
+    let mut add = |name: &str, value: String| rows.push(vec![name.to_owned(), value]);
+    let mb = |bytes: f64| format!("{:.1} MB", bytes / BYTES_PER_MB);
+    if let Some(last) = samples.last() {
+        for part in &PARTS {
+            if let Some(bytes) = (part.bytes)(last) {
+                add(&format!("{} at the end", part.label), mb(bytes as f64));
+            }
+        }
+        add("peak of resident memory", mb(resident_bytes()?.1 as f64));
+        add("keyframes", format!("{}, {} evicted", last.keyframes, last.evicted));
+        add("steps", last.step.to_string());
+        add("pictures for viewers", last.pictures.to_string());
+    }
+    for (name, growth) in &growths {
+        let (from, to) = (growth.from_seconds, growth.to_seconds);
+        let of = format!("{} an hour, {:+.2} %", mb(growth.bytes_per_hour), growth.percent_per_hour);
+        add(&format!("growth {name}, {from:.0} s to {to:.0} s"), of);
+    }
+    let mut gpu_parts: Vec<(&Arc<str>, u64)> =
+        measured.gpu_parts.iter().map(|(label, bytes)| (label, *bytes)).collect();
+    gpu_parts.sort_by_key(|(_, bytes)| std::cmp::Reverse(*bytes));
+    let gpu_rows =
+        gpu_parts.iter().take(MAX_GPU_PARTS).map(|(label, bytes)| vec![label.to_string(), mb(*bytes as f64)]);
+    Ok(Findings {
+        name: "memory",
+        title: "Memory of a long run".to_owned(),
+        sentences: vec![
+            format!("{conditions}: {rate}."),
+            "Growth is that of resident memory from a minute after the keyframe store is full: the median of the slopes between \
+             all pairs of samples. On a software adapter GPU buffers are a part of resident memory; the model's own, and the working \
+             memory of training, whose size goes with the model's, are taken off."
+                .to_owned(),
+        ],
+        charts: vec![(
+            "",
+            Chart {
+                title: "Memory of a long run".to_owned(),
+                subtitle: format!("{conditions}; {rate}"),
+                x: Axis { label: "minutes since the first image".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
+                y: Axis { label: "MB".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
+                lines,
+                floors: Vec::new(),
+                rules: rules.into_iter().collect(),
+            },
+        )],
+        tables: vec![
+            Table { title: "Memory".to_owned(), head: vec!["what".to_owned(), "value".to_owned()], rows },
+            Table {
+                title: "Largest GPU buffers at the end".to_owned(),
+                head: vec!["label".to_owned(), "size".to_owned()],
+                rows: gpu_rows.collect(),
+            },
+        ],
+        numbers: serde_json::json!({
+            "input": args.input(),
+            "viewers": args.viewers,
+            "growth": growths.iter().map(|(name, growth)| (*name, growth)).collect::<BTreeMap<_, _>>(),
+            "gpu_parts": gpu_parts.iter().map(|(label, bytes)| (label.as_ref(), bytes)).collect::<BTreeMap<_, _>>(),
+            "peak_resident_bytes": resident_bytes()?.1,
+            "samples": samples,
+        }),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Debug, Parser)]
+    struct Flags {
+        #[command(flatten)]
+        args: Args,
+    }
+
+    fn args(flags: &[&str]) -> Args {
+        Flags::parse_from(["memory", "rig.toml"].iter().chain(flags)).args
+    }
+
+    #[test]
+    fn flags_of_run_are_passed_on_and_wrong_ones_named() {
+        let folder = Path::new("some");
+        assert!(args(&["--sim", "--", "--method", "tsdf"]).run_flags(folder).is_ok());
+        let refused = args(&["--sim", "--", "--metod", "tsdf"]).run_flags(folder).expect_err("no such flag");
+        assert!(refused.to_string().contains("--metod"), "{refused}");
+        for flags in [["--seconds", "0"], ["--seconds", "NaN"], ["--every-secs", "-1"]] {
+            let flags = [format!("{}={}", flags[0], flags[1])];
+            let refused = args(&[flags[0].as_str()]).check().expect_err("out of range").to_string();
+            assert!(refused.starts_with("--"), "{refused}");
+        }
+    }
+
+    #[test]
+    fn findings_say_how_fast_memory_grows() {
+        let sample = |ix: u64| Sample {
+            seconds: ix as f64,
+            resident_bytes: 1_000_000_000 + 10_000 * ix,
+            gpu_bytes: 400_000_000,
+            keyframe_bytes: 300_000_000,
+            keyframes: 100,
+            evicted: u64::from(ix > 30),
+            ..Sample::default()
+        };
+        let samples: Vec<Sample> = (0..600).map(sample).collect();
+        let gpu_parts = BTreeMap::from([("small".into(), 1), ("large".into(), 2)]);
+        let mut measured = Measured { is_software: true, samples, gpu_parts, input_error: None };
+        let of_host =
+            Measured { is_software: false, ..Measured { samples: measured.samples.clone(), ..Measured::default() } };
+        let of_host = findings(&args(&["--sim"]), &of_host).expect("numbers");
+        assert!(
+            of_host.sentences[0].contains("+3.59") && of_host.sentences[0].contains("host"),
+            "{}",
+            of_host.sentences[0]
+        );
+        measured.samples.iter_mut().for_each(|sample| sample.model_bytes = sample.resident_bytes - 900_000_000);
+        let findings = findings(&args(&["--sim"]), &measured).expect("numbers");
+        assert!(findings.sentences[0].contains("+0.00 % an hour beyond the model"), "{}", findings.sentences[0]);
+        assert_eq!(findings.tables[1].rows[0][0], "large");
+        let chart = &findings.charts[0].1;
+        assert_eq!(chart.lines.len(), 5, "nothing is known of what is reserved");
+        assert!(chart.lines.iter().all(|line| line.points.len() <= MAX_POINTS), "{}", chart.lines[0].points.len());
+        assert_eq!(chart.rules[0].label, "store full: 100 keyframes");
+        assert_eq!(findings.numbers["samples"].as_array().map(Vec::len), Some(600));
+    }
+}

@@ -1,0 +1,237 @@
+//! `fieldrig view`: the web page for saved models.
+
+use super::run::{address, notes};
+use crate::exit::{BadArgument, Exit};
+use crate::method::{self, Loaded};
+use crate::model_bounds::Bounds;
+use crate::stop::Stop;
+use crate::viewer::{ShownModel, Viewer};
+use crate::{camera_list, data, print, run_folder, scene_hint};
+use kinematics::Transform;
+use nalgebra::{Translation3, UnitQuaternion, Vector3};
+use serde_json::{Value, json};
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use trainer::Progress;
+use viz::{Hub, KeyframePose, ModelStatus, SceneHint, Server, ServerConfig, Status};
+
+/// Flags of `view`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Folder of a saved model or of a run of several methods, or a file of splats (.ply, .spz)
+    model: PathBuf,
+    /// Address of the page, as numbers [default: 127.0.0.1:7007, or a free port if that one is in use]
+    #[arg(long, value_name = "ADDRESS", value_parser = address)]
+    listen: Option<SocketAddr>,
+    /// Axis that points up in the model: x, y, z, -x, -y or -z; files of other programs are often -y up
+    #[arg(long, value_name = "AXIS", default_value = "z", allow_hyphen_values = true, value_parser = up_axis)]
+    up: Up,
+    /// Print one JSON object a line
+    #[arg(long)]
+    json: bool,
+}
+
+/// Direction that points up in the model's world.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Up(Vector3<f64>);
+
+fn up_axis(text: &str) -> Result<Up, String> {
+    let (sign, axis) = text.strip_prefix('-').map_or((1.0, text), |axis| (-1.0, axis));
+    let axis = match axis {
+        "x" => Vector3::x(),
+        "y" => Vector3::y(),
+        "z" => Vector3::z(),
+        _ => return Err("expected x, y, z, -x, -y or -z".to_owned()),
+    };
+    Ok(Up(sign * axis))
+}
+
+impl Up {
+    /// The page is z up.
+    fn model_from_page(self) -> Transform {
+        let rotation = UnitQuaternion::rotation_between(&Vector3::z(), &self.0);
+        // Half a turn about any horizontal axis where the two are opposite.
+        let rotation = rotation.unwrap_or_else(|| UnitQuaternion::new(std::f64::consts::PI * Vector3::x()));
+        Transform::from_parts(Translation3::identity(), rotation)
+    }
+}
+
+/// Serves the page until Ctrl-C.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    refuse_other_than_model(&args.model)?;
+    let paths = run_folder::models_at(&args.model)?;
+    let stop = Stop::on_ctrl_c_logging("stopping; Ctrl-C again ends at once")?;
+    let gpu = super::open_gpu()?;
+    let hub = Hub::new();
+    // Before the models are loaded: an address in use is reported at once.
+    let server = start_server(args.listen, &hub)?;
+
+    let model_from_page = args.up.model_from_page();
+    let cameras = cameras(&paths);
+    let models = paths.iter().map(|path| method::load_with_bounds(gpu.clone(), path, cameras.is_empty()));
+    let models = models.collect::<anyhow::Result<Vec<Loaded>>>()?;
+    let mut statuses =
+        paths.iter().zip(&models).map(|(path, model)| model_status(path, model.kind.name(), &model.method.progress()));
+    let report = report(&paths[0]);
+    let status = Status {
+        state: "viewing".to_owned(),
+        seconds: report["done"]["seconds"].as_f64().unwrap_or_default(),
+        keyframes: cameras.len() as u64,
+        model: statuses.next().unwrap_or_default(),
+        others: statuses.collect(),
+        notes: notes(&gpu),
+        ..Status::default()
+    };
+    let cameras = in_page(cameras, &model_from_page);
+    if let Some(hint) = first_view(&cameras, models.iter().find_map(|model| model.bounds), &model_from_page) {
+        hub.set_scene_hint(hint);
+    }
+    hub.set_keyframes(cameras);
+    hub.set_status(status);
+
+    args.print_url(&server.url(), &models)?;
+    let models = models.into_iter().map(|Loaded { kind, method, .. }| ShownModel { kind, method }).collect();
+    Viewer::new(models, hub).with_model_from_page(model_from_page).serve(&stop);
+    Ok(Exit::Done)
+}
+
+impl Args {
+    fn print_url(&self, url: &str, models: &[Loaded]) -> anyhow::Result<()> {
+        if self.json {
+            let methods: Vec<&str> = models.iter().map(|model| model.kind.name()).collect();
+            return print::report_json(&json!({ "event": "serving", "url": url, "methods": methods }));
+        }
+        print::report(format_args!("open {url} in a browser"));
+        Ok(())
+    }
+}
+
+/// The server at the given address, or at the default one, or if that is in use at a free port.
+fn start_server(listen: Option<SocketAddr>, hub: &Hub) -> Result<Server, viz::Error> {
+    let usual = ServerConfig::default();
+    match (listen, Server::start(listen.map_or(usual, |listen| ServerConfig { listen }), hub.clone())) {
+        (None, Err(viz::Error::AddressInUse { address })) => {
+            log::info!("{address} is in use by another program; taking a free port");
+            let mut listen = usual.listen;
+            listen.set_port(0);
+            Server::start(ServerConfig { listen }, hub.clone())
+        }
+        (_, started) => started,
+    }
+}
+
+/// Refuses what people take for a model, and names the command that it is for.
+fn refuse_other_than_model(model: &Path) -> Result<(), BadArgument> {
+    let shown = model.display();
+    let is_url = |scheme: &str| model.to_str().is_some_and(|text| text.starts_with(scheme));
+    if ["http://", "https://", "ws://", "wss://"].into_iter().any(is_url) {
+        return Err(BadArgument(format!(
+            "{shown} is the address of a page: open it in a browser; view shows saved models and files of splats"
+        )));
+    }
+    if model.is_file() && data::is_recording(model) {
+        return Err(BadArgument(format!(
+            "{shown} is a recording, not a model: `fieldrig train` makes a model of it, and `fieldrig run RIG.toml --from \
+             {shown}` shows how one grows"
+        )));
+    }
+    if drivers::dataset::is_dataset_folder(model) && run_folder::models_at(model).is_err() {
+        return Err(BadArgument(format!(
+            "{shown} is a dataset, not a model: `fieldrig train {shown}` makes one of it; name the folder of that run"
+        )));
+    }
+    Ok(())
+}
+
+/// The cameras of the first model whose folder lists them; a list that cannot be read is only a warning.
+fn cameras(models: &[PathBuf]) -> Vec<KeyframePose> {
+    let read = |folder: &PathBuf| {
+        camera_list::read(folder).unwrap_or_else(|error| {
+            log::warn!("cameras are not shown: {error:#}");
+            None
+        })
+    };
+    let folders = models.iter().filter(|model| model.is_dir());
+    folders.filter_map(read).find(|cameras| !cameras.is_empty()).unwrap_or_default()
+}
+
+fn in_page(cameras: Vec<KeyframePose>, model_from_page: &Transform) -> Vec<KeyframePose> {
+    let page_from_model = model_from_page.inverse();
+    let in_page =
+        |camera: KeyframePose| KeyframePose { world_from_camera: page_from_model * camera.world_from_camera, ..camera };
+    cameras.into_iter().map(in_page).collect()
+}
+
+/// Where the view starts: from the first camera, else from outside the model; `None` for an empty model.
+fn first_view(cameras: &[KeyframePose], bounds: Option<Bounds>, model_from_page: &Transform) -> Option<SceneHint> {
+    let poses = cameras.iter().map(|camera| camera.world_from_camera).collect();
+    scene_hint::from_cameras(poses).or_else(|| {
+        let Bounds { center_m, radius_m } = bounds?;
+        let center = model_from_page.inverse() * nalgebra::Point3::from(center_m);
+        Some(scene_hint::from_bounds(&Bounds { center_m: center.coords.into(), radius_m }))
+    })
+}
+
+/// What the report in a model's folder says; `Null` where there is none.
+fn report(model: &Path) -> Value {
+    let text = std::fs::read_to_string(model.join("report.json")).unwrap_or_default();
+    serde_json::from_str(&text).unwrap_or_default()
+}
+
+/// What a model is, and how it scored when its training ended.
+fn model_status(model: &Path, method: &str, progress: &Progress) -> ModelStatus {
+    let report = report(model);
+    let (done, marks) = (&report["done"], report["marks"].as_array());
+    let point = |mark: &Value| Some((mark["seconds"].as_f64()?, mark["psnr"].as_f64()?));
+    ModelStatus {
+        method: method.to_owned(),
+        step: done["steps"].as_u64().unwrap_or(progress.step),
+        step_millis: None,
+        primitives: progress.primitives,
+        bytes: progress.bytes,
+        psnr: done["psnr"].as_f64(),
+        psnr_history: marks.into_iter().flatten().chain([done]).filter_map(point).collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Point3;
+
+    #[test]
+    fn the_up_axis_of_a_model_is_up_on_the_page() {
+        const ABS: f64 = 1e-12;
+        for (text, up) in [
+            ("z", [0.0, 0.0, 1.0]),
+            ("-z", [0.0, 0.0, -1.0]),
+            ("y", [0.0, 1.0, 0.0]),
+            ("-y", [0.0, -1.0, 0.0]),
+            ("-x", [-1.0, 0.0, 0.0]),
+        ] {
+            let Up(axis) = up_axis(text).expect("an axis");
+            assert_eq!(axis, Vector3::from(up), "{text}");
+            let in_page = Up(axis).model_from_page().inverse() * Point3::from(up);
+            assert!((in_page - Point3::new(0.0, 0.0, 1.0)).norm() < ABS, "{text}: {in_page}");
+        }
+        for wrong in ["", "up", "--z", "Z", "xy"] {
+            assert!(up_axis(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn the_score_is_the_reports() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let progress = Progress { primitives: 5, bytes: 80, ..Progress::default() };
+        let status = model_status(folder.path(), "splat", &progress);
+        assert_eq!((status.psnr, status.step, status.primitives, status.bytes), (None, 0, 5, 80));
+        let text = json!({
+            "done": { "psnr": 23.5, "steps": 700, "seconds": 8.0 },
+            "marks": [{ "seconds": 0.5, "psnr": 20.0 }, { "seconds": 1.0, "psnr": null }, { "seconds": 2.0, "psnr": 22.0 }],
+        });
+        std::fs::write(folder.path().join("report.json"), text.to_string()).expect("room on the disk");
+        let status = model_status(folder.path(), "splat", &progress);
+        assert_eq!((status.psnr, status.step), (Some(23.5), 700));
+        assert_eq!(status.psnr_history, [(0.5, 20.0), (2.0, 22.0), (8.0, 23.5)]);
+    }
+}

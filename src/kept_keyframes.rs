@@ -1,0 +1,306 @@
+//! The keyframes of a live run on disk, beside its checkpoint: what `run --resume` needs to continue.
+//!
+//! Each keyframe is a file of its own, in the layout of a checkpoint (`docs/saving.md`) with its pixels and depth as PNG.
+//! What only a simulator knows is left out.
+
+use crate::join::{split_name, split_named};
+use anyhow::{Context, ensure};
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ExtendedColorType, ImageEncoder};
+use kinematics::{Stamp, Transform, Twist};
+use nalgebra::{Quaternion, Translation3, UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use trainer::checkpoint::{Array, Checkpoint};
+use trainer::{BasePlace, DepthMap, Keyframe};
+
+/// The folder, in that of a run.
+pub(crate) const FOLDER: &str = "keyframes";
+const ENDING: &str = "keyframe";
+const METHOD: &str = "keyframe";
+const COLOR: &str = "rgba_srgb.png";
+const DEPTH: &str = "depth_m.png";
+
+/// A folder of keyframes.
+#[derive(Clone, Debug)]
+pub(crate) struct KeptKeyframes {
+    folder: PathBuf,
+}
+
+/// All of a keyframe but its pixels.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Description {
+    camera: String,
+    stamp_nanos: i64,
+    size_px: [u32; 2],
+    focal_px: [f64; 2],
+    principal_px: [f64; 2],
+    world_from_camera: [f64; 7],
+    twist: Option<[f64; 6]>,
+    readout_secs: f64,
+    joint_twists: Vec<[f64; 6]>,
+    split: String,
+    depth: Option<DepthDescription>,
+    base: Option<BaseDescription>,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct DepthDescription {
+    size_px: [u32; 2],
+    focal_px: [f64; 2],
+    principal_px: [f64; 2],
+    world_from_camera: [f64; 7],
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct BaseDescription {
+    stand: Option<usize>,
+    world_from_base: [f64; 7],
+    world_from_told: [f64; 7],
+}
+
+impl KeptKeyframes {
+    /// Those of the run in a folder; nothing is read or written yet.
+    pub(crate) fn of_run(run: &Path) -> Self {
+        Self { folder: run.join(FOLDER) }
+    }
+
+    /// Writes the keyframes that are not there yet.
+    pub(crate) fn add(&self, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
+        std::fs::create_dir_all(&self.folder).with_context(|| format!("cannot make {}", self.folder.display()))?;
+        let there = self.names()?;
+        for keyframe in keyframes {
+            let name = name_of(keyframe);
+            if !there.contains(&name) {
+                container(keyframe)?.write(&self.folder.join(name))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Removes all files but those of these keyframes.
+    pub(crate) fn keep_only(&self, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
+        let kept: BTreeSet<String> = keyframes.iter().map(|keyframe| name_of(keyframe)).collect();
+        for name in self.names()?.difference(&kept) {
+            let path = self.folder.join(name);
+            std::fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))?;
+        }
+        Ok(())
+    }
+
+    /// Reads all, in the order of their stamps.
+    pub(crate) fn read(&self) -> anyhow::Result<Vec<Arc<Keyframe>>> {
+        let mut keyframes = Vec::new();
+        for name in self.names()? {
+            let path = self.folder.join(name);
+            let read = || keyframe_of(&Checkpoint::read(&path)?);
+            keyframes.push(Arc::new(read().with_context(|| format!("cannot read the keyframe {}", path.display()))?));
+        }
+        keyframes.sort_by(|one, other| (one.stamp, &one.camera).cmp(&(other.stamp, &other.camera)));
+        Ok(keyframes)
+    }
+
+    fn names(&self) -> anyhow::Result<BTreeSet<String>> {
+        let list = || {
+            let names = std::fs::read_dir(&self.folder)?.map(|entry| entry.map(|entry| entry.file_name()));
+            names.collect::<std::io::Result<Vec<_>>>()
+        };
+        let names = list().with_context(|| format!("cannot list {}", self.folder.display()))?;
+        let names = names.into_iter().filter_map(|name| name.into_string().ok());
+        Ok(names.filter(|name| Path::new(name).extension().is_some_and(|ending| ending == ENDING)).collect())
+    }
+}
+
+fn name_of(keyframe: &Keyframe) -> String {
+    format!("{}_{:020}.{ENDING}", keyframe.camera, keyframe.stamp.0)
+}
+
+fn container(keyframe: &Keyframe) -> anyhow::Result<Checkpoint> {
+    let description = Description {
+        camera: keyframe.camera.to_string(),
+        stamp_nanos: keyframe.stamp.0,
+        size_px: keyframe.size_px,
+        focal_px: keyframe.focal_px,
+        principal_px: keyframe.principal_px,
+        world_from_camera: numbers(&keyframe.world_from_camera),
+        twist: keyframe.twist.as_ref().map(twist_numbers),
+        readout_secs: keyframe.readout_secs,
+        joint_twists: keyframe.joint_twists.iter().map(twist_numbers).collect(),
+        split: split_name(keyframe.split).to_owned(),
+        depth: keyframe.depth.as_ref().map(|depth| DepthDescription {
+            size_px: depth.size_px,
+            focal_px: depth.focal_px,
+            principal_px: depth.principal_px,
+            world_from_camera: numbers(&depth.world_from_camera),
+        }),
+        base: keyframe.base.as_ref().map(|base| BaseDescription {
+            stand: base.stand,
+            world_from_base: numbers(&base.world_from_base),
+            world_from_told: numbers(&base.world_from_told),
+        }),
+    };
+    let mut arrays = vec![Array { name: COLOR.to_owned(), bytes: png(keyframe.size_px, &keyframe.rgba_srgb)? }];
+    if let Some(depth) = &keyframe.depth {
+        let bytes: Vec<u8> = depth.depth_m.iter().flat_map(|depth_m| depth_m.to_le_bytes()).collect();
+        arrays.push(Array { name: DEPTH.to_owned(), bytes: png(depth.size_px, &bytes)? });
+    }
+    Ok(Checkpoint {
+        method: METHOD.to_owned(),
+        seconds: 0.0,
+        depth_from: None,
+        flags: BTreeMap::new(),
+        is_finished: false,
+        state: serde_json::to_value(description)?,
+        arrays,
+    })
+}
+
+fn keyframe_of(container: &Checkpoint) -> anyhow::Result<Keyframe> {
+    ensure!(container.method == METHOD, "it holds a {}, expected a {METHOD}", container.method);
+    let about: Description = serde_json::from_value(container.state.clone())?;
+    let pixels = |name: &str, size_px: [u32; 2]| {
+        let array = container.arrays.iter().find(|array| array.name == name);
+        let png = &array.with_context(|| format!("array {name:?} is missing"))?.bytes;
+        let image = image::load_from_memory_with_format(png, image::ImageFormat::Png)?;
+        ensure!([image.width(), image.height()] == size_px, "array {name:?} has another size than {size_px:?}");
+        Ok(image.into_rgba8().into_raw())
+    };
+    let depth = about.depth.map(|depth| {
+        let bytes = pixels(DEPTH, depth.size_px)?;
+        let depth_m = bytes.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes));
+        Ok::<_, anyhow::Error>(DepthMap {
+            size_px: depth.size_px,
+            focal_px: depth.focal_px,
+            principal_px: depth.principal_px,
+            depth_m: depth_m.collect(),
+            world_from_camera: transform(depth.world_from_camera),
+        })
+    });
+    Ok(Keyframe {
+        camera: about.camera.into(),
+        stamp: Stamp(about.stamp_nanos),
+        size_px: about.size_px,
+        focal_px: about.focal_px,
+        principal_px: about.principal_px,
+        rgba_srgb: pixels(COLOR, about.size_px)?.into(),
+        depth: depth.transpose()?,
+        world_from_camera: transform(about.world_from_camera),
+        twist: about.twist.map(twist),
+        readout_secs: about.readout_secs,
+        joint_twists: about.joint_twists.into_iter().map(twist).collect(),
+        base: about.base.map(|base| BasePlace {
+            stand: base.stand,
+            world_from_base: transform(base.world_from_base),
+            world_from_told: transform(base.world_from_told),
+            truth: None,
+        }),
+        split: split_named(&about.split).with_context(|| format!("there is no split {:?}", about.split))?,
+        truth: None,
+    })
+}
+
+/// Four bytes a pixel, without loss. Depth is stored so, too: the bytes of an f32 differ little from one pixel to the next.
+fn png([width, height]: [u32; 2], bytes: &[u8]) -> anyhow::Result<Vec<u8>> {
+    let mut png = Vec::new();
+    let encoder = PngEncoder::new_with_quality(&mut png, CompressionType::Fast, FilterType::Sub);
+    encoder.write_image(bytes, width, height, ExtendedColorType::Rgba8)?;
+    Ok(png)
+}
+
+/// A translation, then a quaternion with its real part last.
+fn numbers(pose: &Transform) -> [f64; 7] {
+    let [x, y, z] = pose.translation.vector.into();
+    let [i, j, k, w] = pose.rotation.coords.into();
+    [x, y, z, i, j, k, w]
+}
+
+/// The inverse of [`numbers`], to the last bit.
+fn transform([x, y, z, i, j, k, w]: [f64; 7]) -> Transform {
+    Transform::from_parts(Translation3::new(x, y, z), UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k)))
+}
+
+fn twist_numbers(twist: &Twist) -> [f64; 6] {
+    let ([x, y, z], [a, b, c]) = (twist.linear_m_s.into(), twist.angular_rad_s.into());
+    [x, y, z, a, b, c]
+}
+
+fn twist([x, y, z, a, b, c]: [f64; 6]) -> Twist {
+    Twist { linear_m_s: Vector3::new(x, y, z), angular_rad_s: Vector3::new(a, b, c) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fingerprint;
+    use trainer::Split;
+
+    fn keyframe(stamp_nanos: i64, depth: bool) -> Arc<Keyframe> {
+        let pose = Transform::new(Vector3::new(0.1, 1.0 / 3.0, -2.0), Vector3::new(0.3, -0.2, 0.1));
+        Arc::new(Keyframe {
+            camera: "wrist".into(),
+            stamp: Stamp(stamp_nanos),
+            size_px: [5, 3],
+            focal_px: [4.0, 4.1],
+            principal_px: [2.5, 1.5],
+            rgba_srgb: (0..60).map(|ix| ix * 4).collect(),
+            depth: depth.then(|| DepthMap {
+                size_px: [2, 2],
+                focal_px: [1.5; 2],
+                principal_px: [1.0; 2],
+                depth_m: vec![0.0, 1.0 / 3.0, f32::MIN_POSITIVE, 7.25].into(),
+                world_from_camera: pose.inverse(),
+            }),
+            world_from_camera: pose,
+            twist: depth.then(|| twist([0.1, 0.2, 0.3, 0.4, 0.5, 0.7])),
+            readout_secs: 0.015,
+            joint_twists: vec![twist([1.0, 2.0, 3.0, 4.0, 5.0, 1.0 / 7.0])].into(),
+            base: depth.then(|| BasePlace {
+                stand: Some(3),
+                world_from_base: pose,
+                world_from_told: pose * pose,
+                truth: None,
+            }),
+            split: Split::Selection,
+            truth: None,
+        })
+    }
+
+    #[test]
+    fn keyframes_come_back_bit_for_bit_and_in_order() {
+        let run = tempfile::tempdir().expect("a folder");
+        let kept = KeptKeyframes::of_run(run.path());
+        let all = [keyframe(9_000_000_000, true), keyframe(20, false), keyframe(10_000_000_000, true)];
+        kept.add(&all[..2]).expect("room");
+        kept.add(&all).expect("room");
+        let read = kept.read().expect("whole");
+        let in_order = [&all[1], &all[0], &all[2]];
+        assert_eq!(read.len(), 3);
+        for (read, expected) in read.iter().zip(in_order) {
+            assert_eq!((read.stamp, &read.camera, read.split), (expected.stamp, &expected.camera, expected.split));
+            assert_eq!(fingerprint::of(read), fingerprint::of(expected));
+            assert_eq!(read.base, expected.base);
+        }
+        kept.keep_only(&all[1..]).expect("they are there");
+        assert_eq!(kept.read().expect("whole").len(), 2);
+    }
+
+    #[test]
+    fn a_damaged_file_is_named() {
+        let run = tempfile::tempdir().expect("a folder");
+        let kept = KeptKeyframes::of_run(run.path());
+        assert!(kept.read().is_err(), "there is no folder");
+        kept.add(&[keyframe(1, true)]).expect("room");
+        let path = run.path().join(FOLDER).join("wrist_00000000000000000001.keyframe");
+        let mut bytes = std::fs::read(&path).expect("a file");
+        let middle = bytes.len() / 2;
+        bytes[middle] ^= 1;
+        std::fs::write(&path, bytes).expect("room");
+        let told = format!("{:#}", kept.read().expect_err("damaged"));
+        assert!(told.contains("wrist_00000000000000000001.keyframe") && told.contains("damaged"), "{told}");
+    }
+}

@@ -1,0 +1,116 @@
+//! Where most of a saved model lies, for a first view of models whose cameras are unknown.
+
+use trainer::splat::arrays::SplatArrays;
+use trainer::tsdf::Lattice;
+use trainer::tsdf::block::{BLOCK_EDGE, Place};
+
+/// Share of the points that lie within the radius: stray points and far backgrounds stay outside.
+const INSIDE_FRAC: f64 = 0.8;
+/// A model of one point still has some size, in meters.
+const MIN_RADIUS_M: f64 = 0.01;
+/// With fewer opaque splats than this share, all splats count.
+const MIN_OPAQUE_FRAC: f64 = 0.02;
+
+/// A sphere that holds most of a model.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Bounds {
+    /// In world, meters.
+    pub(crate) center_m: [f64; 3],
+    pub(crate) radius_m: f64,
+}
+
+impl Bounds {
+    /// Around the median of the splats that are at least half opaque; `None` without splats.
+    pub(crate) fn of_splats(splats: &SplatArrays) -> Option<Self> {
+        let n_opaque = splats.opacity_logits.iter().filter(|logit| **logit > 0.0).count();
+        let takes_all = (n_opaque as f64) < MIN_OPAQUE_FRAC * splats.n_splats() as f64;
+        let kept = splats.means.iter().zip(&splats.opacity_logits).filter(|(_, logit)| takes_all || **logit > 0.0);
+        Self::of_points(&kept.map(|(mean, _)| mean.map(f64::from)).collect::<Vec<_>>())
+    }
+
+    /// Around the blocks of a distance field; `None` without blocks.
+    pub(crate) fn of_blocks<'a>(blocks: impl Iterator<Item = &'a Place>, lattice: &Lattice) -> Option<Self> {
+        let center = |place: &Place| {
+            let along = |axis: usize| (f64::from(place[axis]) + 0.5) * f64::from(BLOCK_EDGE) * lattice.voxel_m;
+            [0, 1, 2].map(|axis| lattice.anchor_m[axis] + along(axis))
+        };
+        Self::of_points(&blocks.map(center).collect::<Vec<_>>())
+    }
+
+    /// The median along each axis, and the radius that holds [`INSIDE_FRAC`] of the points.
+    fn of_points(points_m: &[[f64; 3]]) -> Option<Self> {
+        if points_m.is_empty() {
+            return None;
+        }
+        let center_m = [0, 1, 2].map(|axis| quantile(points_m.iter().map(|point| point[axis]).collect(), 0.5));
+        let distance_m = |point: &[f64; 3]| {
+            let squared = point.iter().zip(center_m).map(|(along, center)| (along - center).powi(2));
+            squared.sum::<f64>().sqrt()
+        };
+        let radius_m = quantile(points_m.iter().map(distance_m).collect(), INSIDE_FRAC);
+        Some(Self { center_m, radius_m: radius_m.max(MIN_RADIUS_M) })
+    }
+}
+
+/// The value that a share of all values does not exceed; `values` is not empty.
+fn quantile(mut values: Vec<f64>, frac: f64) -> f64 {
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of a length")]
+    let rank = (frac * (values.len() - 1) as f64).round() as usize;
+    *values.select_nth_unstable_by(rank, f64::total_cmp).1
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A cloud of splats: where each is, and how opaque.
+    fn splats(points: &[([f32; 3], f32)]) -> SplatArrays {
+        SplatArrays {
+            means: points.iter().map(|(mean, _)| *mean).collect(),
+            log_scales: vec![[-3.0; 3]; points.len()],
+            rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; points.len()],
+            opacity_logits: points.iter().map(|(_, logit)| *logit).collect(),
+            sh: vec![[0.0; 3]; points.len()],
+            sh_degree: 0,
+        }
+    }
+
+    #[test]
+    fn strays_and_transparent_splats_move_nothing() {
+        let mut points: Vec<([f32; 3], f32)> = Vec::new();
+        // A disk, evenly filled along a spiral of golden angles.
+        for ix in 0u8..100 {
+            let (radius, angle) = ((f32::from(ix) / 100.0).sqrt(), f32::from(ix) * 2.399_963);
+            points.push(([2.0 + radius * angle.cos(), radius * angle.sin(), 1.0], 3.0));
+        }
+        let alone = Bounds::of_splats(&splats(&points)).expect("splats");
+        assert!((alone.center_m[0] - 2.0).abs() < 0.1 && (alone.radius_m - 0.9).abs() < 0.1, "{alone:?}");
+        points.extend([([500.0, 0.0, 0.0], 3.0); 5]);
+        points.extend([([-50.0, 9.0, 0.0], -4.0); 300]);
+        let with_strays = Bounds::of_splats(&splats(&points)).expect("splats");
+        assert!((with_strays.center_m[0] - 2.0).abs() < 0.2 && with_strays.radius_m < 1.2, "{with_strays:?}");
+    }
+
+    #[test]
+    fn few_or_no_splats_have_bounds_too() {
+        assert_eq!(Bounds::of_splats(&splats(&[])), None);
+        let one = Bounds::of_splats(&splats(&[([1.0, 2.0, 3.0], -9.0)])).expect("a splat");
+        assert_eq!(one, Bounds { center_m: [1.0, 2.0, 3.0], radius_m: MIN_RADIUS_M });
+    }
+
+    #[test]
+    fn blocks_lie_where_their_lattice_has_them() {
+        let lattice = Lattice {
+            voxel_m: 0.125,
+            truncation_m: 0.5,
+            scale_m: 0.5,
+            noise_per_m2: 0.0,
+            max_depth_m: 9.0,
+            max_weight: 1,
+            anchor_m: [10.0, 0.0, -1.0],
+        };
+        let bounds = Bounds::of_blocks([[0, 0, 0], [1, 0, 0], [2, 0, 0]].iter(), &lattice).expect("blocks");
+        assert_eq!(bounds.center_m, [11.5, 0.5, -0.5]);
+        assert_eq!(bounds.radius_m, 1.0);
+    }
+}

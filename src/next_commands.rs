@@ -1,0 +1,178 @@
+//! What to type after a training: commands that work as printed, in the folder in which the training was started.
+
+use crate::method::Kind;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// The images that a model was trained on, for commands that need them again.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct DataSource {
+    /// Dataset folder or recording; `None` where a live run was not recorded.
+    pub(crate) path: Option<PathBuf>,
+    /// Flags that `eval` needs to see the same images.
+    pub(crate) flags: Vec<String>,
+    /// Names of the images, by camera and stamp.
+    pub(crate) image_names: BTreeMap<(String, i64), String>,
+}
+
+impl DataSource {
+    /// The file name of an image, else its camera and stamp.
+    pub(crate) fn image_name(&self, camera: &str, stamp_nanos: i64) -> String {
+        let known = self.image_names.get(&(camera.to_owned(), stamp_nanos));
+        known.cloned().unwrap_or_else(|| format!("{camera}/{stamp_nanos}"))
+    }
+}
+
+/// A saved model, as the commands need to know it.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct SavedModel<'a> {
+    pub(crate) kind: Kind,
+    pub(crate) folder: &'a Path,
+    pub(crate) data: &'a DataSource,
+    pub(crate) n_tests: usize,
+}
+
+/// One command, and what it is for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct NextCommand {
+    pub(crate) purpose: &'static str,
+    pub(crate) command: String,
+}
+
+/// The commands for models that were trained together.
+pub(crate) fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
+    let program = std::env::args_os().next().map_or("fieldrig".into(), |word| word.to_string_lossy().into_owned());
+    let mut commands = Vec::new();
+    let mut add = |purpose, words: &[&str]| {
+        let words: Vec<String> = std::iter::once(&*program).chain(words.iter().copied()).map(quoted).collect();
+        commands.push(NextCommand { purpose, command: words.join(" ") });
+    };
+    if let Some(folder) = common_folder(models) {
+        add("look at it", &["view", &argument(folder)]);
+    }
+    for model in models {
+        let folder = argument(model.folder);
+        if let (Some(data), 1..) = (&model.data.path, model.n_tests) {
+            let list = argument(&model.folder.join("keyframes.txt"));
+            let mut words = vec!["eval", &*folder];
+            let data = argument(data);
+            words.extend([&*data, "--keyframes", &list]);
+            words.extend(model.data.flags.iter().map(String::as_str));
+            add("score it again", &words);
+        }
+        let (format, purpose) = match model.kind {
+            Kind::Splat => ("spz", "use it elsewhere"),
+            Kind::Tsdf => ("glb", "use its mesh elsewhere"),
+            Kind::Nerf => continue, // Other programs cannot read it.
+        };
+        let out = argument(&free_file(&model_name(model.folder), format));
+        add(purpose, &["export", &folder, "--to", format, "--out", &out]);
+    }
+    commands
+}
+
+/// The command line of this process.
+pub(crate) fn this_command() -> String {
+    std::env::args_os().map(|word| quoted(&word.to_string_lossy())).collect::<Vec<_>>().join(" ")
+}
+
+/// Purposes and commands in two columns.
+pub(crate) fn lines(commands: &[NextCommand]) -> Vec<String> {
+    let width = commands.iter().map(|next| next.purpose.len()).max().unwrap_or_default() + 1;
+    let line = |next: &NextCommand| format!("{:width$}  {}", format!("{}:", next.purpose), next.command);
+    commands.iter().map(line).collect()
+}
+
+/// The folder to view: a model's own, or the one in which each of several methods has one.
+fn common_folder<'a>(models: &[SavedModel<'a>]) -> Option<&'a Path> {
+    match models {
+        [] => None,
+        [model] => Some(model.folder),
+        [model, ..] => model.folder.parent(),
+    }
+}
+
+/// Name of the files made from a model: that of its folder, which in a run of several methods is the method's.
+fn model_name(folder: &Path) -> String {
+    folder.file_name().map_or_else(|| "model".to_owned(), |name| name.to_string_lossy().into_owned())
+}
+
+/// A file of this name in the current folder that does not exist yet: `export` refuses to replace one.
+fn free_file(name: &str, ending: &str) -> PathBuf {
+    let numbered =
+        |n: u32| PathBuf::from(if n == 1 { format!("{name}.{ending}") } else { format!("{name}-{n}.{ending}") });
+    (1..100).map(numbered).find(|file| !file.exists()).unwrap_or_else(|| numbered(100))
+}
+
+/// A path as a positional argument: one that begins with a hyphen would be taken for a flag.
+fn argument(path: &Path) -> String {
+    let text = path.to_string_lossy();
+    if text.starts_with('-') { format!("./{text}") } else { text.into_owned() }
+}
+
+/// A word as a shell reads it back.
+pub(crate) fn quoted(word: &str) -> String {
+    let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "_-./:=@%+,".contains(letter);
+    if !word.is_empty() && word.chars().all(is_plain) {
+        return word.to_owned();
+    }
+    format!("'{}'", word.replace('\'', r"'\''"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_shell_reads_quoted_words_back() {
+        for word in ["plain/path-1.spz", "two words", "it's", "$HOME `x` \"y\" \\ *", "", "naïve", "a\nb"] {
+            let output = std::process::Command::new("sh").args(["-c", &format!("printf %s {}", quoted(word))]).output();
+            assert_eq!(String::from_utf8_lossy(&output.expect("sh starts").stdout), word);
+        }
+        assert_eq!(quoted("runs/20261123-170000"), "runs/20261123-170000");
+    }
+
+    #[test]
+    fn each_kind_of_model_has_the_commands_that_it_can_be_given() {
+        let data = DataSource {
+            path: Some("my data".into()),
+            flags: vec!["--scale".into(), "0.5".into()],
+            ..DataSource::default()
+        };
+        let model = |kind, folder| SavedModel { kind, folder: Path::new(folder), data: &data, n_tests: 3 };
+        let commands = |models: &[SavedModel<'_>]| -> Vec<String> {
+            let program = quoted(&std::env::args().next().expect("a program"));
+            let strip = |next: NextCommand| next.command.trim_start_matches(&format!("{program} ")).to_owned();
+            for_models(models).into_iter().map(strip).collect()
+        };
+        assert_eq!(
+            commands(&[model(Kind::Splat, "runs/a b")]),
+            [
+                "view 'runs/a b'",
+                "eval 'runs/a b' 'my data' --keyframes 'runs/a b/keyframes.txt' --scale 0.5",
+                "export 'runs/a b' --to spz --out 'a b.spz'",
+            ]
+        );
+        assert_eq!(
+            commands(&[model(Kind::Nerf, "both/nerf"), model(Kind::Tsdf, "both/tsdf")]),
+            [
+                "view both",
+                "eval both/nerf 'my data' --keyframes both/nerf/keyframes.txt --scale 0.5",
+                "eval both/tsdf 'my data' --keyframes both/tsdf/keyframes.txt --scale 0.5",
+                "export both/tsdf --to glb --out tsdf.glb",
+            ]
+        );
+        let live = DataSource::default();
+        let unscored = SavedModel { data: &live, ..model(Kind::Nerf, "-out") };
+        assert_eq!(commands(&[unscored]), ["view ./-out"]);
+        assert_eq!(commands(&[]), Vec::<String>::new());
+    }
+
+    #[test]
+    fn images_without_a_name_are_named_by_camera_and_stamp() {
+        let mut data = DataSource::default();
+        data.image_names.insert(("camera".into(), 8), "images/0008.jpg".into());
+        assert_eq!(data.image_name("camera", 8), "images/0008.jpg");
+        assert_eq!(data.image_name("camera", 9), "camera/9");
+    }
+}

@@ -1,0 +1,119 @@
+//! Files and folders under way: whole in the end, or not there.
+//!
+//! A [`Partial`] removes what it names unless it is kept, after an error and after a signal alike.
+
+use anyhow::Context;
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::iterator::Signals;
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+/// What is under way in this process.
+static UNDER_WAY: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
+/// Shells report a process ended by a signal as this plus the signal's number.
+const ENDED_BY_SIGNAL: i32 = 128;
+
+/// Files or folders being written; removed on drop unless they were kept.
+#[derive(Debug)]
+#[must_use = "dropped, it removes what it names"]
+pub(crate) struct Partial(Vec<PathBuf>);
+
+impl Partial {
+    /// A file that is about to be written, under its own name or, until it is whole, with `.part` after it.
+    pub(crate) fn file(path: &Path) -> Self {
+        Self::begin(vec![path.to_owned(), trainer::whole_file::partial_path(path)])
+    }
+
+    /// A folder that is about to be filled with these entries: all of it where it does not exist yet.
+    pub(crate) fn folder(path: &Path, entries: &[&str]) -> Self {
+        if path.exists() {
+            return Self::begin(entries.iter().map(|entry| path.join(entry)).collect());
+        }
+        Self::begin(vec![path.to_owned()])
+    }
+
+    /// What exists already is somebody else's, and stays.
+    fn begin(paths: Vec<PathBuf>) -> Self {
+        let paths: Vec<PathBuf> = paths.into_iter().filter(|path| !path.exists()).collect();
+        under_way().extend(paths.iter().cloned());
+        Self(paths)
+    }
+
+    /// Keeps what was written: it is whole.
+    pub(crate) fn keep(mut self) {
+        let paths = std::mem::take(&mut self.0);
+        under_way().retain(|path| !paths.contains(path));
+    }
+}
+
+impl Drop for Partial {
+    fn drop(&mut self) {
+        let mut under_way = under_way();
+        for path in &self.0 {
+            remove(path);
+            under_way.remove(path);
+        }
+    }
+}
+
+/// Makes SIGINT, SIGTERM and SIGHUP remove what is under way before they end the process.
+///
+/// For commands that have nothing to save when they are cancelled; others use [`crate::stop::Stop`].
+pub(crate) fn remove_on_signals() -> anyhow::Result<()> {
+    let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP]).context("cannot listen to signals")?;
+    let remove_all = move || {
+        if let Some(signal) = signals.forever().next() {
+            // Held to the end, so that nothing begins meanwhile.
+            let under_way = under_way();
+            under_way.iter().for_each(|path| remove(path));
+            std::process::exit(ENDED_BY_SIGNAL + signal);
+        }
+    };
+    std::thread::Builder::new().name("signals".into()).spawn(remove_all).context("cannot start a thread")?;
+    Ok(())
+}
+
+fn under_way() -> MutexGuard<'static, BTreeSet<PathBuf>> {
+    UNDER_WAY.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn remove(path: &Path) {
+    let removed = if path.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
+    match removed {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            log::warn!("cannot remove {}, which is not whole: {error}", path.display());
+        }
+        _ => {}
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_not_kept_is_removed_and_nothing_else() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let at = |name: &str| folder.path().join(name);
+        for keeps in [false, true] {
+            let (file, new) = (Partial::file(&at("scene.ply")), Partial::folder(&at("new"), &["images"]));
+            let there = Partial::folder(folder.path(), &["images", "test.txt"]);
+            for name in ["scene.ply", "scene.ply.part", "other", "test.txt"] {
+                std::fs::write(at(name), b"x").expect("room");
+            }
+            std::fs::create_dir_all(at("new/depth")).expect("room");
+            std::fs::create_dir_all(at("images/a")).expect("room");
+            if keeps {
+                [file, new, there].into_iter().for_each(Partial::keep);
+            } else {
+                drop([file, new, there]);
+            }
+            let exist = ["scene.ply", "new", "images", "test.txt"].map(|name| at(name).exists());
+            assert_eq!(exist, [keeps; 4]);
+            assert!(at("other").exists());
+        }
+        drop([Partial::file(&at("scene.ply")), Partial::folder(&at("new"), &["depth"])]);
+        assert!(at("scene.ply").exists() && at("new/depth").exists(), "they were there before");
+    }
+}

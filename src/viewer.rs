@@ -1,0 +1,70 @@
+//! Draws finished models for the page: the loop of a run without devices and training.
+
+use crate::method::Kind;
+use crate::stop::Stop;
+use kinematics::Transform;
+use std::time::Duration;
+use trainer::{Aabb, Method, RenderRequest};
+use viz::{Hub, PendingRender};
+
+/// How long Ctrl-C may go unnoticed while no client asks for anything.
+const WAIT: Duration = Duration::from_millis(100);
+
+/// A model that clients can look at.
+pub(crate) struct ShownModel {
+    pub(crate) kind: Kind,
+    pub(crate) method: Box<dyn Method>,
+}
+
+/// Models that no longer change, and the hub whose clients look at them.
+pub(crate) struct Viewer {
+    /// The first is drawn for clients that do not name a method.
+    models: Vec<ShownModel>,
+    hub: Hub,
+    /// The page is z up; a model may not be.
+    model_from_page: Transform,
+}
+
+impl Viewer {
+    /// A viewer of models that are z up.
+    pub(crate) fn new(models: Vec<ShownModel>, hub: Hub) -> Self {
+        Self { models, hub, model_from_page: Transform::identity() }
+    }
+
+    /// Rotates the models so that they are upright in the page's world, which is z up.
+    pub(crate) fn with_model_from_page(self, model_from_page: Transform) -> Self {
+        Self { model_from_page, ..self }
+    }
+
+    /// Draws what clients ask for until a signal asks for the end.
+    pub(crate) fn serve(&mut self, stop: &Stop) {
+        while !stop.signaled() {
+            if self.hub.wait_for_request(WAIT)
+                && let Some(pending) = self.hub.next_request()
+            {
+                self.answer(pending);
+            }
+        }
+    }
+
+    fn answer(&mut self, pending: PendingRender) {
+        let request = in_model(&pending.request, &self.model_from_page);
+        let wanted = pending.method().map(str::to_owned);
+        let is_wanted = |model: &&mut ShownModel| wanted.as_deref().is_none_or(|name| model.kind.name() == name);
+        let Some(model) = self.models.iter_mut().find(is_wanted) else {
+            let names: Vec<&str> = self.models.iter().map(|model| model.kind.name()).collect();
+            let wanted = wanted.unwrap_or_default();
+            return pending.fail(&format!("no model of the method {wanted:?} here, only {}", names.join(", ")));
+        };
+        match model.method.render(&request) {
+            Ok(picture) => pending.deliver(picture),
+            Err(error) => pending.fail(&error.to_string()),
+        }
+    }
+}
+
+/// A request of the page in the model's own world frame.
+fn in_model(request: &RenderRequest, model_from_page: &Transform) -> RenderRequest {
+    let crop = request.crop.map(|crop| Aabb { world_from_box: model_from_page * crop.world_from_box, ..crop });
+    RenderRequest { world_from_camera: model_from_page * request.world_from_camera, crop, ..request.clone() }
+}

@@ -1,0 +1,157 @@
+//! A GPU that is lost in the middle of a run, and one without memory: the run continues, or stops with what it has.
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+use serde_json::{Value, json};
+use std::path::Path;
+use std::process::{Command, Output};
+use trainer::checkpoint::Checkpoint;
+
+const SIZE_PX: [u32; 2] = [64, 48];
+
+/// Ten photos of a patterned wall, taken from places in a row.
+fn dataset(folder: &Path) {
+    std::fs::create_dir(folder).unwrap();
+    let mut frames = Vec::new();
+    for ix in 0..10 {
+        let name = format!("{ix:03}.png");
+        let shade = |x: u32, y: u32| u8::try_from((x / 8 + y / 8 + ix) % 2 * 150 + x).unwrap();
+        let photo = image::RgbImage::from_fn(SIZE_PX[0], SIZE_PX[1], |x, y| {
+            image::Rgb([shade(x, y), shade(y, x), u8::try_from(5 * y).unwrap()])
+        });
+        photo.save(folder.join(&name)).unwrap();
+        let x = 0.05 * f64::from(ix);
+        let pose = [[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 1.0, 2.0], [0.0, 0.0, 0.0, 1.0]];
+        frames.push(json!({ "file_path": name, "transform_matrix": pose }));
+    }
+    let lens = json!({ "w": 64, "h": 48, "fl_x": 60.0, "fl_y": 60.0, "cx": 32.0, "cy": 24.0, "frames": frames });
+    std::fs::write(folder.join("transforms.json"), lens.to_string()).unwrap();
+}
+
+fn fieldrig(folder: &Path, args: &[&str], env: &[(&str, &str)]) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
+    command.args(args).envs(env.iter().copied()).current_dir(folder).output().unwrap()
+}
+
+fn stderr(output: &Output) -> String {
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!text.contains("panicked"), "{text}");
+    text
+}
+
+/// The last line of a run that succeeded.
+fn done(output: &Output) -> Value {
+    assert!(output.status.success(), "{}", stderr(output));
+    let stdout = String::from_utf8_lossy(&output.stdout);
+    let last: Value = serde_json::from_str(stdout.lines().last().unwrap()).unwrap();
+    assert_eq!(last["event"], "done");
+    last
+}
+
+#[test]
+fn a_training_that_loses_its_gpu_ends_with_the_bits_of_one_that_does_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    dataset(&folder.join("data"));
+    for (method, steps, lost_at, more) in [("splat", "300", "150", ["--max-splats", "600"])] {
+        let train = |out: &str, checkpoint_secs: &str, env: &[(&str, &str)]| {
+            let args = ["train", "data", "--json", "--steps", steps, "--method", method, "--out", out];
+            fieldrig(folder, &[&args[..], &["--checkpoint-secs", checkpoint_secs], &more].concat(), env)
+        };
+        let out = |name: &str| format!("{method}-{name}");
+        let whole = done(&train(&out("whole"), "60", &[]));
+        for (name, checkpoint_secs, continues_from) in
+            [("early", "100000", "from the start"), ("late", "0.1", "from the checkpoint of step")]
+        {
+            let lost = train(&out(name), checkpoint_secs, &[("FIELDRIG_TEST_LOSE_GPU_AT_STEP", lost_at)]);
+            let text = stderr(&lost);
+            assert!(text.contains("attempt 1 of 3") && text.contains(continues_from), "{text}");
+            assert!(!text.contains("attempt 2"), "{text}");
+            let lost = done(&lost);
+            assert_eq!(lost["checkpoint_sha256"], whole["checkpoint_sha256"], "{method}, {name}: {text}");
+            assert_eq!(lost["steps"], whole["steps"]);
+        }
+    }
+}
+
+#[test]
+fn where_the_gpu_does_not_come_back_the_checkpoint_and_the_command_that_continues_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    dataset(&folder.join("data"));
+    let common = ["train", "data", "--json", "--steps", "300"];
+    let first = [&common[..], &["--max-splats", "600"]].concat();
+    let whole = done(&fieldrig(folder, &[&first[..], &["--out", "whole"]].concat(), &[]));
+    let env = [("FIELDRIG_TEST_LOSE_GPU_AT_STEP", "150"), ("FIELDRIG_TEST_OPEN_GPU_ONCE", "1")];
+
+    let lost = fieldrig(folder, &[&first[..], &["--out", "lost", "--checkpoint-secs", "0.1"]].concat(), &env);
+    let text = stderr(&lost);
+    assert_eq!(lost.status.code(), Some(1), "{text}");
+    assert!(text.contains("no GPU adapter found") && text.contains("attempt 3 of 3"), "{text}");
+    assert!(text.contains("lost/training.ckpt: `fieldrig train data --resume lost` continues from it"), "{text}");
+    let step = Checkpoint::read(&folder.join("lost/training.ckpt")).unwrap().state["step"].as_u64().unwrap();
+    assert!((1..300).contains(&step), "{step}");
+    let resumed = done(&fieldrig(folder, &[&common[..], &["--resume", "lost"]].concat(), &[]));
+    assert_eq!(resumed["checkpoint_sha256"], whole["checkpoint_sha256"]);
+
+    let early = fieldrig(folder, &[&first[..], &["--out", "early"]].concat(), &env);
+    assert_eq!(early.status.code(), Some(1));
+    assert!(stderr(&early).contains("no checkpoint was written yet: start the run again"), "{}", stderr(&early));
+}
+
+#[test]
+fn a_gpu_without_memory_for_more_splats_keeps_those_it_has() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    dataset(&folder.join("data"));
+    let train = |out: &str, env: &[(&str, &str)]| {
+        fieldrig(folder, &["train", "data", "--json", "--steps", "300", "--plan-steps", "1500", "--out", out], env)
+    };
+    let free = done(&train("free", &[]));
+    // Room for the first 50 000 splats and for drawing them, but not for half as many more.
+    let full = train("full", &[("FIELDRIG_TEST_GPU_BYTES", "48000000")]);
+    let text = stderr(&full);
+    assert_eq!(text.matches("the model stops growing at").count(), 1, "{text}");
+    let full = done(&full);
+    assert_eq!(full["steps"], 300);
+    assert!(full["primitives"].as_u64() < free["primitives"].as_u64(), "{full} {free}");
+
+    // Not even enough to begin: one sentence, and no panic.
+    let none = train("none", &[("FIELDRIG_TEST_GPU_BYTES", "3000000")]);
+    assert_eq!(none.status.code(), Some(1));
+    assert!(stderr(&none).contains("the GPU ran out of memory: buffer"), "{}", stderr(&none));
+}
+
+#[cfg(feature = "sim")]
+#[test]
+fn a_live_run_that_loses_its_gpu_continues_and_one_that_cannot_keeps_its_recording() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let rig = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
+    let run = |out: &str, env: &[(&str, &str)]| {
+        let recording = format!("{out}.mcap");
+        let args = ["run", rig.to_str().unwrap(), "--sim", "--lockstep", "--steps", "200", "--max-splats", "2000"];
+        let more =
+            ["--json", "--listen", "127.0.0.1:0", "--checkpoint-secs", "0.5", "--record", &recording, "--out", out];
+        fieldrig(folder, &[&args[..], &more[..]].concat(), env)
+    };
+    let lost = run("lost", &[("FIELDRIG_TEST_LOSE_GPU_AT_STEP", "120")]);
+    let text = stderr(&lost);
+    assert!(text.contains("the GPU is back: training continues from"), "{text}");
+    assert_eq!(done(&lost)["steps"], 200);
+
+    let gone = run("gone", &[("FIELDRIG_TEST_LOSE_GPU_AT_STEP", "120"), ("FIELDRIG_TEST_OPEN_GPU_ONCE", "1")]);
+    let text = stderr(&gone);
+    assert_eq!(gone.status.code(), Some(1), "{text}");
+    assert!(
+        (text.contains("`fieldrig run ") && text.contains("--resume gone`"))
+            || text.contains("no checkpoint was written yet"),
+        "{text}"
+    );
+    let listed = std::fs::read_to_string(folder.join("gone/keyframes.txt")).unwrap();
+    assert!(listed.lines().count() >= 12, "{listed}");
+    // The recording is closed: it can be trained on as it is.
+    let args = ["train", "gone.mcap", "--json", "--steps", "20", "--max-splats", "500", "--out", "again"];
+    let again = fieldrig(folder, &args, &[]);
+    assert!(again.status.success(), "{}", stderr(&again));
+    assert!(!stderr(&again).contains("cut off"), "{}", stderr(&again));
+}

@@ -1,0 +1,268 @@
+//! Output that cannot be written never costs what is being made: closed terminals, closed pipes, full disks.
+#![cfg(target_os = "linux")]
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+mod small_rig;
+mod wall;
+
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use std::ffi::OsStr;
+use std::fs::{File, OpenOptions};
+use std::io::{BufRead, BufReader, Read};
+use std::os::unix::ffi::OsStrExt;
+use std::path::Path;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+
+const EXE: &str = env!("CARGO_BIN_EXE_fieldrig");
+/// Longer than any of these commands takes to end on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(240);
+/// A loss, as `--help` names it: lines of output.
+const LOSS: i32 = 3;
+
+/// A program on a terminal of its own, which can be closed.
+struct OnTerminal {
+    child: Child,
+    terminal: File,
+    said: Vec<u8>,
+}
+
+impl OnTerminal {
+    /// Starts `fieldrig`; with `controlled` the terminal controls it, as that of a person does, and sends SIGHUP when it closes.
+    fn start(folder: &Path, args: &[&str], controlled: bool) -> Self {
+        let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
+        grantpt(&master).unwrap();
+        unlockpt(&master).unwrap();
+        let name = ptsname(&master, Vec::new()).unwrap();
+        let open = || OpenOptions::new().read(true).write(true).open(OsStr::from_bytes(name.to_bytes())).unwrap();
+        let mut command = Command::new(if controlled { "setsid" } else { EXE });
+        if controlled {
+            command.args(["--ctty", EXE]);
+        }
+        let child = command.args(args).current_dir(folder).stdin(open()).stdout(open()).stderr(open()).spawn().unwrap();
+        Self { child, terminal: File::from(master), said: Vec::new() }
+    }
+
+    /// Reads until the program has printed this.
+    fn wait_for(&mut self, text: &str) {
+        let mut bytes = [0; 4096];
+        while !self.said.windows(text.len()).any(|window| window == text.as_bytes()) {
+            let n = self.terminal.read(&mut bytes).unwrap_or(0);
+            assert!(n > 0, "no {text:?} in {}", String::from_utf8_lossy(&self.said));
+            self.said.extend(&bytes[..n]);
+        }
+    }
+
+    /// Closes the terminal; the program's end comes back.
+    fn close(self) -> ExitStatus {
+        drop(self.terminal);
+        end_of(self.child)
+    }
+}
+
+fn end_of(mut child: Child) -> ExitStatus {
+    let asked = Instant::now();
+    loop {
+        if let Some(status) = child.try_wait().unwrap() {
+            return status;
+        }
+        if asked.elapsed() > PATIENCE {
+            child.kill().unwrap();
+            panic!("it did not end");
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// Fails unless the model in a folder can be read.
+fn expect_model(folder: &Path, model: &str) {
+    let to = format!("{model}-exported.ply");
+    let output = wall::fieldrig(folder, &["export", model, "--to", "ply", "--out", &to]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+/// Fails unless the recording can be read to its end.
+#[cfg(feature = "sim")]
+fn expect_recording(folder: &Path, recording: &str) {
+    let to = format!("{recording}-exported");
+    let output = wall::fieldrig(folder, &["export", recording, "--to", "nerfstudio", "--out", &to]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+#[test]
+fn a_training_survives_its_terminal() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    wall::write(&folder.join("data"), true, 0.0);
+    for (n, millis) in [0_u64, 300, 900].into_iter().enumerate() {
+        let out = format!("out{n}");
+        let args = ["train", "data", "--seconds", "60", "--max-splats", "600", "--out", &out];
+        let mut run = OnTerminal::start(folder, &args, true);
+        run.wait_for("step");
+        std::thread::sleep(Duration::from_millis(millis));
+        assert_eq!(run.close().code(), Some(LOSS), "closed after {millis} ms");
+        expect_model(folder, &out);
+    }
+}
+
+#[test]
+fn a_training_goes_on_where_no_signal_comes_with_the_end_of_its_terminal() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    wall::write(&folder.join("data"), true, 0.0);
+    let args = ["train", "data", "--steps", "300", "--max-splats", "600", "--out", "out"];
+    let mut run = OnTerminal::start(folder, &args, false);
+    run.wait_for("step");
+    assert_eq!(run.close().code(), Some(LOSS));
+    let report = std::fs::read_to_string(folder.join("out/report.json")).unwrap();
+    assert!(report.contains("\"steps\": 300"), "it trained to the end");
+    expect_model(folder, "out");
+}
+
+#[test]
+fn a_training_does_not_wait_for_a_terminal_that_takes_no_output() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    wall::write(&folder.join("data"), true, 0.0);
+    // As behind a broken connection: the terminal is there, and nobody reads. 8 kB fill it.
+    let args = ["train", "data", "--steps", "300", "--max-splats", "600", "--out", "out", "-vv"];
+    let mut run = OnTerminal::start(folder, &args, true);
+    run.wait_for("step");
+    let OnTerminal { child, terminal, .. } = run;
+    assert_eq!(end_of(child).code(), Some(LOSS));
+    drop(terminal);
+    expect_model(folder, "out");
+}
+
+#[test]
+fn a_training_survives_a_closed_pipe_and_a_full_disk_behind_stdout() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    wall::write(&folder.join("data"), true, 0.0);
+    let train = |out: &str| {
+        let mut command = Command::new(EXE);
+        command.args(["train", "data", "--seconds", "2", "--max-splats", "600", "--json", "--out", out]);
+        command.current_dir(folder);
+        command
+    };
+    // As with `| head -1`.
+    let mut head = train("head").stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+    let mut line = String::new();
+    BufReader::new(head.stdout.take().unwrap()).read_line(&mut line).unwrap();
+    assert!(line.starts_with('{'), "{line}");
+    assert_eq!(end_of(head).code(), Some(LOSS));
+    expect_model(folder, "head");
+
+    let full = || OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let output = train("full").stdout(full()).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(LOSS), "{said}");
+    assert!(said.contains("cannot write to stdout") && said.contains("No space left"), "{said}");
+    expect_model(folder, "full");
+    // Without stderr, too.
+    assert_eq!(train("mute").stdout(full()).stderr(full()).status().unwrap().code(), Some(LOSS));
+    expect_model(folder, "mute");
+
+    // Where the output is the result, a reader that went away is no loss.
+    let mut fk = Command::new(EXE);
+    fk.args(["metrics", "data/00.png", "data/00.png"]).current_dir(folder);
+    assert_eq!(fk.stdout(full()).output().unwrap().status.code(), Some(1), "the result is lost");
+}
+
+#[cfg(feature = "sim")]
+#[test]
+fn runs_and_recordings_survive_their_terminal() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    small_rig::write(folder, small_rig::Pace::RealTime);
+    for (n, millis) in [0_u64, 700].into_iter().enumerate() {
+        let (out, recording) = (format!("out{n}"), format!("run{n}.mcap"));
+        let run = ["run", "rig.toml", "--sim", "--record", &recording, "--out", &out, "--listen", "127.0.0.1:0"];
+        let mut run = OnTerminal::start(folder, &run, true);
+        run.wait_for("step");
+        std::thread::sleep(Duration::from_millis(millis));
+        assert_eq!(run.close().code(), Some(LOSS));
+        expect_model(folder, &out);
+        expect_recording(folder, &recording);
+
+        let recording = format!("record{n}.mcap");
+        let mut record = OnTerminal::start(folder, &["record", "rig.toml", "--sim", "--out", &recording], true);
+        record.wait_for("color images");
+        std::thread::sleep(Duration::from_millis(1000 + millis));
+        assert_eq!(record.close().code(), Some(LOSS));
+        expect_recording(folder, &recording);
+    }
+}
+
+/// A small disk, unmounted on drop.
+#[cfg(feature = "sim")]
+struct SmallDisk<'a>(&'a Path);
+
+#[cfg(feature = "sim")]
+impl<'a> SmallDisk<'a> {
+    /// None where this user may not mount one.
+    fn mount(at: &'a Path, size: &str) -> Option<Self> {
+        std::fs::create_dir(at).unwrap();
+        let option = format!("size={size}");
+        let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", &option, "tmpfs"]).arg(at).output().unwrap();
+        if !mounted.status.success() {
+            eprintln!("skipped: mounting a tmpfs needs root");
+        }
+        mounted.status.success().then_some(Self(at))
+    }
+}
+
+#[cfg(feature = "sim")]
+impl Drop for SmallDisk<'_> {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg("--lazy").arg(self.0).status();
+    }
+}
+
+#[cfg(feature = "sim")]
+#[test]
+fn on_a_full_disk_a_recording_is_read_as_reported_and_a_model_is_saved_elsewhere() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    small_rig::write(folder, small_rig::Pace::Lockstep);
+    let disk = folder.join("disk");
+    let Some(_disk) = SmallDisk::mount(&disk, "1m") else { return };
+    let record = ["record", "rig.toml", "--sim", "--seconds", "30", "--json", "--out", "disk/run.mcap"];
+    let output = wall::fieldrig(folder, &record);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(LOSS), "{said}");
+    let reported: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let count = |key: &str| reported[key].as_u64().unwrap();
+    let n_samples = ["images", "depth_images", "joint_states", "truths"].map(count).iter().sum::<u64>();
+    assert!(said.contains(&format!("({n_samples} samples)")), "{n_samples}: {said}");
+    // One number everywhere: the reader counts the same.
+    let read = wall::fieldrig(folder, &["export", "disk/run.mcap", "--to", "nerfstudio", "--out", "read"]);
+    let read_said = String::from_utf8_lossy(&read.stderr);
+    assert!(read_said.contains(&format!("after {n_samples} readable samples")), "{n_samples}: {read_said}");
+
+    // Room for the lists, not for the model.
+    std::fs::remove_file(disk.join("run.mcap")).unwrap();
+    std::fs::write(disk.join("filler"), vec![1; 900 << 10]).unwrap();
+    wall::write(&folder.join("data"), true, 0.0);
+    let temporary = folder.join("temporary");
+    std::fs::create_dir(&temporary).unwrap();
+    let train = |temporary: &Path| {
+        let mut train = Command::new(EXE);
+        train.args(["train", "data", "--steps", "120", "--max-splats", "60000", "--out", "disk/out"]);
+        train.args(["--checkpoint-secs", "0"]).env("TMPDIR", temporary).current_dir(folder);
+        train.output().unwrap()
+    };
+    let output = train(&temporary);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("cannot save the model in disk/out, it was saved in "), "{said}");
+    let saved = std::fs::read_dir(&temporary).unwrap().next().unwrap().unwrap().path();
+    expect_model(folder, saved.strip_prefix(folder).unwrap().to_str().unwrap());
+    assert!(!disk.join("out/model.part").exists(), "what is not whole takes no room");
+
+    std::fs::remove_dir_all(disk.join("out")).unwrap();
+    let output = train(&disk);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("cannot save the model in disk/out; no checkpoint was written yet"), "{said}");
+}

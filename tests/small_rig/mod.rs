@@ -1,0 +1,48 @@
+//! A small simulated rig for tests of the whole program.
+#![cfg(feature = "sim")]
+#![allow(dead_code, reason = "each test uses a part of it")]
+
+use std::path::Path;
+
+/// How many times smaller than in the shipped rig file its images are along each side.
+const SMALLER: i64 = 4;
+
+/// How its time passes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Pace {
+    /// Samples are computed when they are asked for.
+    Lockstep,
+    /// As with real devices.
+    RealTime,
+}
+
+/// Writes `rig.toml` into a folder: `rigs/static-arm.toml` at a quarter of its size, without flaws, and what it names.
+pub(crate) fn write(folder: &Path, pace: Pace) {
+    write_with(folder, |sim| {
+        sim.insert("lockstep".into(), (pace == Pace::Lockstep).into());
+    });
+}
+
+/// As [`write`], with a change of the table `[sim]`.
+pub(crate) fn write_with(folder: &Path, change: impl FnOnce(&mut toml::Table)) {
+    let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
+    let text = std::fs::read_to_string(rigs.join("static-arm.toml")).expect("a shipped rig file");
+    let mut rig: toml::Table = text.parse().expect("TOML");
+    let urdf = rig["arm"]["urdf"].as_str().expect("a robot").to_owned();
+    std::fs::create_dir_all(folder.join(&urdf).parent().expect("inside the folder")).expect("room on the disk");
+    std::fs::copy(rigs.join(&urdf), folder.join(&urdf)).expect("the robot's description");
+    let wrist = rig["camera"]["wrist"].as_table_mut().expect("a camera");
+    for (table, key) in [("", "size_px"), ("intrinsics", "focal_px"), ("intrinsics", "principal_px")] {
+        let holder = if table.is_empty() { &mut *wrist } else { wrist[table].as_table_mut().expect("a table") };
+        for number in holder[key].as_array_mut().expect("two numbers") {
+            *number = match &*number {
+                toml::Value::Integer(whole) => toml::Value::Integer(whole / SMALLER),
+                other => toml::Value::Float(other.as_float().expect("a number") / SMALLER as f64),
+            };
+        }
+    }
+    let sim = rig["sim"].as_table_mut().expect("a simulation");
+    sim.insert("ideal".into(), true.into());
+    change(sim);
+    std::fs::write(folder.join("rig.toml"), rig.to_string()).expect("room on the disk");
+}

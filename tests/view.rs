@@ -1,0 +1,398 @@
+//! `fieldrig view` and the report page of a training: what a browser gets, and what is refused.
+
+mod wall;
+
+use serde_json::{Value, json};
+use std::io::{BufRead, BufReader};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::path::Path;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::Duration;
+use tungstenite::{Message, WebSocket};
+use wall::fieldrig;
+
+/// Far more than two busy cores need for a small picture.
+const PATIENCE: Duration = Duration::from_secs(120);
+const SIZE_PX: [u32; 2] = [96, 72];
+/// Angle from the top to the bottom of a picture, degrees.
+const FOV_DEGREES: f64 = 50.0;
+
+/// Trains on the photos of a wall; what was printed comes back.
+fn train(folder: &Path, args: &[&str]) -> String {
+    let output = fieldrig(folder, &[&["train"], args].concat());
+    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).expect("stdout is UTF-8")
+}
+
+/// A running `fieldrig view`.
+struct View {
+    process: Child,
+    serving: Value,
+}
+
+impl View {
+    fn start(folder: &Path, args: &[&str]) -> Self {
+        let mut process = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
+            .args(["view", "--json"])
+            .args(args)
+            .current_dir(folder)
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("fieldrig starts");
+        let mut lines = BufReader::new(process.stdout.take().expect("piped")).lines();
+        let line = lines.next().expect("a line before the end").expect("stdout is read");
+        Self { process, serving: serde_json::from_str(&line).expect("a JSON object") }
+    }
+
+    fn address(&self) -> SocketAddr {
+        let url = self.serving["url"].as_str().expect("an address");
+        url.trim_start_matches("http://").trim_end_matches('/').parse().expect("numbers")
+    }
+
+    /// Ends it as Ctrl-C does.
+    fn interrupt(mut self) -> ExitStatus {
+        let kill = format!("kill -INT {}", self.process.id());
+        assert!(Command::new("sh").args(["-c", &kill]).status().expect("sh starts").success());
+        self.process.wait().expect("it ends")
+    }
+}
+
+impl Drop for View {
+    fn drop(&mut self) {
+        let _ = self.process.kill(); // It has ended unless a test failed.
+    }
+}
+
+/// A connected page.
+struct Client {
+    socket: WebSocket<TcpStream>,
+    n_asked: u64,
+}
+
+impl Client {
+    fn connect(view: &View) -> Self {
+        let address = view.address();
+        let stream = TcpStream::connect(address).expect("the server listens");
+        stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
+        let (socket, _) = tungstenite::client(format!("ws://{address}/ws"), stream).expect("a WebSocket");
+        Self { socket, n_asked: 0 }
+    }
+
+    /// The next message: JSON, and the payload of a binary one.
+    fn receive(&mut self) -> (Value, Vec<u8>) {
+        loop {
+            match self.socket.read().expect("an answer") {
+                Message::Text(text) => return (serde_json::from_str(&text).expect("JSON"), Vec::new()),
+                Message::Binary(bytes) => {
+                    let (length, rest) = bytes.split_at(4);
+                    let (header, payload) =
+                        rest.split_at(u32::from_le_bytes(length.try_into().expect("4 bytes")) as usize);
+                    return (serde_json::from_slice(header).expect("JSON"), payload.to_vec());
+                }
+                _ => {}
+            }
+        }
+    }
+
+    /// The first messages of these types.
+    fn first<const N: usize>(&mut self, types: [&str; N]) -> [Value; N] {
+        let mut found = types.map(|_| Value::Null);
+        while found.iter().any(Value::is_null) {
+            let (message, _) = self.receive();
+            if let Some(ix) = types.iter().position(|kind| message["type"] == *kind) {
+                found[ix] = message;
+            }
+        }
+        found
+    }
+
+    /// The picture of a pose, decoded; or why there is none.
+    fn ask(&mut self, pose: &[f64], method: Option<&str>) -> Result<image::RgbImage, String> {
+        self.n_asked += 1;
+        let mut message = json!({
+            "type": "render", "id": self.n_asked, "size_px": SIZE_PX, "stages": [1.0], "world_from_camera": pose,
+            "projection": { "kind": "pinhole", "vertical_fov_rad": FOV_DEGREES.to_radians() }, "far_m": 1000.0,
+        });
+        if let Some(method) = method {
+            message["method"] = method.into();
+        }
+        self.socket.send(Message::text(message.to_string())).expect("sent");
+        loop {
+            let (answer, payload) = self.receive();
+            if answer["id"] != json!(self.n_asked) {
+                continue;
+            }
+            if answer["type"] == "error" {
+                return Err(answer["message"].as_str().expect("a sentence").to_owned());
+            }
+            return Ok(image::load_from_memory(&payload).expect("a JPEG").into_rgb8());
+        }
+    }
+}
+
+fn pose_of(message: &Value) -> Vec<f64> {
+    let pose = message["world_from_camera"].as_array().expect("a pose");
+    pose.iter().map(|number| number.as_f64().expect("a number")).collect()
+}
+
+/// What `render` draws of a model at a pose.
+fn rendered(folder: &Path, model: &str, pose: &[f64], out: &str) -> image::RgbImage {
+    let pose = pose.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
+    let (size, fov) = (format!("{}x{}", SIZE_PX[0], SIZE_PX[1]), FOV_DEGREES.to_string());
+    let args = ["render", model, "--pose", &pose, "--size", &size, "--fov", &fov, "--out", out, "--json"];
+    let output = fieldrig(folder, &args);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    image::open(folder.join(out).join("00000.png")).expect("a picture").into_rgb8()
+}
+
+/// Mean difference of the colors of two pictures, in 255ths.
+fn difference(a: &image::RgbImage, b: &image::RgbImage) -> f64 {
+    assert_eq!(a.dimensions(), b.dimensions());
+    let sum: f64 = a.as_raw().iter().zip(b.as_raw()).map(|(a, b)| f64::from(a.abs_diff(*b))).sum();
+    sum / a.as_raw().len() as f64
+}
+
+/// Mean brightness, in 255ths.
+fn brightness(picture: &image::RgbImage) -> f64 {
+    picture.as_raw().iter().map(|value| f64::from(*value)).sum::<f64>() / picture.as_raw().len() as f64
+}
+
+/// What JPEG at quality 92 changes of these pictures: measured 1.0.
+const MOST_FROM_JPEG: f64 = 3.0;
+
+#[test]
+fn saved_models_are_shown_as_render_draws_them() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    wall::write(&folder.join("data"), true, 0.0);
+    let methods = ["--method", "tsdf,splat,nerf", "--max-splats", "2000", "--steps", "60", "--out", "all"];
+    train(folder, &[&["data"], &methods[..]].concat());
+
+    let view = View::start(folder, &["all", "--listen", "127.0.0.1:0"]);
+    assert_eq!(view.serving["methods"], json!(["splat", "tsdf", "nerf"]));
+    let mut client = Client::connect(&view);
+    let [status, scene, keyframes] = client.first(["status", "scene", "keyframes"]);
+    assert_eq!((&status["state"], &status["method"]), (&json!("viewing"), &json!("splat")));
+    let methods = status["others"].as_array().expect("a list").iter().map(|model| model["method"].clone());
+    assert_eq!(methods.collect::<Vec<_>>(), ["tsdf", "nerf"]);
+    let report = std::fs::read_to_string(folder.join("all/splat/report.json")).expect("a report");
+    let report: Value = serde_json::from_str(&report).expect("JSON");
+    assert_eq!((&status["psnr"], &status["step"]), (&report["done"]["psnr"], &json!(60)));
+    assert_eq!(status["primitives"], report["done"]["primitives"]);
+    let cameras = keyframes["keyframes"].as_array().expect("cameras");
+    assert_eq!((cameras.len(), &status["keyframes"]), (10, &json!(10)));
+
+    // The view starts where the first camera is.
+    let start = pose_of(&scene);
+    for (number, of_camera) in start.iter().zip(pose_of(&cameras[0])) {
+        assert!((number - of_camera).abs() < 1e-9, "{scene} {}", cameras[0]);
+    }
+    for method in ["splat", "tsdf", "nerf"] {
+        let seen = client.ask(&start, Some(method)).expect("a picture");
+        let expected = rendered(folder, &format!("all/{method}"), &start, &format!("picture-{method}"));
+        let difference = difference(&seen, &expected);
+        assert!(difference < MOST_FROM_JPEG, "{method}: {difference}");
+        assert!(brightness(&seen) > 30.0, "{method}: the picture is dark");
+    }
+    assert_eq!(client.ask(&start, None), client.ask(&start, Some("splat")));
+    let refused = client.ask(&start, Some("mesh")).expect_err("no such model");
+    assert!(refused.contains("\"mesh\"") && refused.contains("splat, tsdf, nerf"), "{refused}");
+    assert_eq!(view.interrupt().code(), Some(0));
+
+    without_cameras(folder);
+}
+
+/// A model without a list of cameras is seen from outside, whichever axis is up.
+fn without_cameras(folder: &Path) {
+    let model = folder.join("all/splat/splats.ply");
+    std::fs::copy(&model, folder.join("lone.ply")).expect("room on the disk");
+    std::fs::remove_file(folder.join("all/tsdf/cameras.json")).expect("a list of cameras");
+    std::fs::remove_file(folder.join("all/nerf/cameras.json")).expect("a list of cameras");
+    for (model, up) in [("lone.ply", "z"), ("lone.ply", "-y"), ("all/tsdf", "z"), ("all/nerf", "z")] {
+        let view = View::start(folder, &[model, "--up", up, "--listen", "127.0.0.1:0"]);
+        let mut client = Client::connect(&view);
+        let [status, scene] = client.first(["status", "scene"]);
+        assert_eq!(status["keyframes"], 0);
+        assert_eq!(status["psnr"].is_null(), model == "lone.ply", "only a folder has a report: {status}");
+        let start = pose_of(&scene);
+        // Upright: the camera's x axis is level, its y axis points down.
+        assert!(start[8].abs() < 1e-9 && start[9] < -0.1, "{start:?}");
+        let seen = client.ask(&start, None).expect("a picture");
+        assert!(brightness(&seen) > 2.0, "{model}, {up} up: nothing is seen from {start:?}");
+        if up == "-y" {
+            // What is up on the page is -y in the model: its world is the page's, turned by a quarter about x.
+            let [x, y, z] = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]];
+            let row = |row: [f64; 4]| (0..4).map(move |column| (row, column));
+            let product =
+                |(row, column): ([f64; 4], usize)| (0..4).map(|k| row[k] * start[4 * k + column]).sum::<f64>();
+            let in_model: Vec<f64> = [x, y, z, [0.0, 0.0, 0.0, 1.0]].into_iter().flat_map(row).map(product).collect();
+            let expected = rendered(folder, model, &in_model, "picture-turned");
+            let difference = difference(&seen, &expected);
+            assert!(difference < MOST_FROM_JPEG, "{difference}");
+        }
+        assert_eq!(view.interrupt().code(), Some(0));
+    }
+}
+
+/// Asserts the exit code and one sentence on stderr that holds every word of `words`.
+fn assert_refused(folder: &Path, args: &[&str], code: i32, words: &[&str]) {
+    let output = fieldrig(folder, args);
+    let printed = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(code), "{args:?}: {printed}");
+    assert!(words.iter().all(|word| printed.contains(word)), "{args:?}: {printed}");
+    assert_eq!(printed.lines().filter(|line| line.starts_with("error: ")).count(), 1, "{args:?}: {printed}");
+}
+
+#[test]
+fn what_is_not_a_model_is_refused_in_one_sentence() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    wall::write(&folder.join("data"), false, 0.0);
+    let write = |name: &str, bytes: &[u8]| std::fs::write(folder.join(name), bytes).expect("room on the disk");
+    std::fs::create_dir(folder.join("cut")).expect("room on the disk");
+    write("cut/training.ckpt", b"a checkpoint");
+    write("scan.mcap", b"\x89MCAP0\r\n");
+    write("new.spz", b"NGSP\x04\0\0\0and so on");
+    write("torn.ply", b"ply\n");
+    let refused = |model: &str, code: i32, words: &[&str]| assert_refused(folder, &["view", model], code, words);
+    refused("absent", 1, &["absent does not exist"]);
+    refused("cut", 1, &["cut holds no model", "train --resume"]);
+    refused("scan.mcap", 2, &["scan.mcap is a recording, not a model", "run RIG.toml --from scan.mcap"]);
+    refused("data", 2, &["data is a dataset, not a model", "fieldrig train data"]);
+    refused("new.spz", 1, &["new.spz", "version 4", "only 2 and 3"]);
+    refused("torn.ply", 1, &["torn.ply"]);
+    refused("data/00.png", 2, &["00.png is no file of splats"]);
+    refused("http://127.0.0.1:7007/", 2, &["open it in a browser"]);
+    assert_refused(folder, &["view", "absent", "--up", "north"], 2, &["--up", "-z"]);
+    assert_refused(folder, &["view", "absent", "--listen", "7007"], 2, &["127.0.0.1:7007"]);
+}
+
+#[test]
+fn a_port_that_was_named_and_is_in_use_is_refused_and_the_usual_one_is_replaced() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    wall::write(&folder.join("data"), false, 0.0);
+    train(folder, &["data", "--steps", "1", "--max-splats", "500", "--out", "model"]);
+    let taken = TcpListener::bind("127.0.0.1:0").expect("a free port");
+    let address = taken.local_addr().expect("bound").to_string();
+    assert_refused(folder, &["view", "model", "--listen", &address], 1, &[&address, "in use", "--listen"]);
+    // Held by this test, or by somebody else already.
+    let _usual = TcpListener::bind("127.0.0.1:7007");
+    let view = View::start(folder, &["model"]);
+    assert_ne!(view.address().port(), 7007);
+    TcpStream::connect(view.address()).expect("the server listens");
+    assert_eq!(view.interrupt().code(), Some(0));
+}
+
+#[test]
+fn a_training_prints_commands_that_work_as_printed_and_writes_a_page() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    wall::write(&folder.join("my data"), true, 0.0);
+    let args = ["my data", "--steps", "200", "--max-splats", "2000", "--scale", "0.75", "--out", "my runs/first one"];
+    let printed = train(folder, &args);
+    let commands: Vec<&str> = printed
+        .lines()
+        .skip_while(|line| !line.starts_with("saved in "))
+        .skip(1)
+        .map(|line| line.split_once(":  ").unwrap_or_else(|| panic!("{line:?} is no command")).1.trim_start())
+        .collect();
+    let verbs: Vec<&str> = commands.iter().map(|command| command.split(' ').nth(1).expect("a verb")).collect();
+    assert_eq!(verbs, ["view", "eval", "export"], "{printed}");
+    for command in &commands[1..] {
+        let output = Command::new("sh").args(["-c", command]).current_dir(folder).output().expect("sh starts");
+        assert!(output.status.success(), "{command}: {}", String::from_utf8_lossy(&output.stderr));
+        let stdout = String::from_utf8_lossy(&output.stdout);
+        if command.contains(" eval ") {
+            let report = std::fs::read_to_string(folder.join("my runs/first one/report.json")).expect("a report");
+            let report: Value = serde_json::from_str(&report).expect("JSON");
+            let psnr = format!("PSNR {:.2} dB", report["done"]["psnr"].as_f64().expect("a score"));
+            assert!(stdout.lines().last().is_some_and(|line| line.contains(&psnr)), "{psnr}: {stdout}");
+            let names: Vec<_> =
+                report["per_image"].as_array().expect("scores").iter().map(|image| &image["name"]).collect();
+            assert_eq!(names, ["00.png", "08.png"]);
+        }
+    }
+    assert!(folder.join("first one.spz").is_file());
+    let mut view = Command::new("sh")
+        .args(["-c", &format!("exec {} --listen 127.0.0.1:0", commands[0])])
+        .current_dir(folder)
+        .stdout(Stdio::piped())
+        .spawn()
+        .expect("sh starts");
+    let mut line = String::new();
+    BufReader::new(view.stdout.take().expect("piped")).read_line(&mut line).expect("stdout is read");
+    assert!(line.starts_with("open http://127.0.0.1:") && line.ends_with("/ in a browser\n"), "{line}");
+    assert!(
+        Command::new("sh").args(["-c", &format!("kill -INT {}", view.id())]).status().expect("sh starts").success()
+    );
+    assert_eq!(view.wait().expect("it ends").code(), Some(0));
+
+    let page = std::fs::read_to_string(folder.join("my runs/first one/report.html")).expect("a page");
+    for words in ["00.png", "08.png", "<svg ", "my data", "eval &apos;my", "--scale"] {
+        let words = words.replace("&apos;", "'");
+        assert!(page.contains(&words), "{words} is missing in the page");
+    }
+    let pictures: Vec<image::RgbImage> = page
+        .split("data:image/jpeg;base64,")
+        .skip(1)
+        .map(|rest| rest.split('"').next().expect("a quoted address"))
+        .map(|text| image::load_from_memory(&bytes_from_base64(text)).expect("a JPEG").into_rgb8())
+        .collect();
+    // Image, render, error and depth of both test images.
+    assert_eq!(pictures.len(), 8);
+    assert!(pictures.iter().all(|picture| picture.dimensions() == (36, 27)), "photos of 48x36, shrunk");
+    // The render is of its own test image rather than of the other one.
+    let [to_own, to_other] = [0, 4].map(|ix| difference(&pictures[ix], &pictures[1]));
+    assert!(to_own < 0.7 * to_other && brightness(&pictures[1]) > 30.0, "{to_own} {to_other}");
+    let others = page.replace("http://www.w3.org/2000/svg", "");
+    assert!(!others.contains("http") && !others.contains("<script"), "the page needs no network");
+}
+
+#[test]
+fn without_test_images_the_page_says_so_and_nothing_is_scored_again() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    wall::write(&folder.join("data"), false, 0.0);
+    train(folder, &["data", "--steps", "1", "--max-splats", "500", "--out", "first"]);
+    let list = std::fs::read_to_string(folder.join("first/keyframes.txt")).expect("a list");
+    std::fs::write(folder.join("list.txt"), list.replace(" test", " train")).expect("room on the disk");
+    let args = ["data", "--steps", "1", "--max-splats", "500", "--keyframes", "list.txt", "--out", "second"];
+    let printed = train(folder, &args);
+    assert!(printed.contains(" view second") && !printed.contains(" eval "), "{printed}");
+    let page = std::fs::read_to_string(folder.join("second/report.html")).expect("a page");
+    assert!(page.contains("no image was held out"), "{page}");
+}
+
+#[test]
+fn a_page_that_cannot_be_written_costs_no_model() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    wall::write(&folder.join("data"), false, 0.0);
+    for file in ["report.html", "cameras.json"] {
+        std::fs::create_dir_all(folder.join("model").join(file).join("in the way")).expect("room on the disk");
+    }
+    let output =
+        fieldrig(folder, &["train", "data", "--steps", "1", "--max-splats", "500", "--out", "model", "--json"]);
+    let printed = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(0), "{printed}");
+    assert!(printed.contains("no report.html") && printed.contains("no cameras.json"), "{printed}");
+    assert!(folder.join("model/splats.ply").is_file() && folder.join("model/report.json").is_file());
+    assert!(!String::from_utf8_lossy(&output.stdout).contains(" view "), "commands are for people");
+}
+
+fn bytes_from_base64(text: &str) -> Vec<u8> {
+    let sextet = |symbol: u8| match symbol {
+        b'A'..=b'Z' => u32::from(symbol - b'A'),
+        b'a'..=b'z' => u32::from(symbol - b'a') + 26,
+        b'0'..=b'9' => u32::from(symbol - b'0') + 52,
+        b'+' => 62,
+        _ => 63,
+    };
+    let symbols: Vec<u8> = text.bytes().filter(|symbol| *symbol != b'=').collect();
+    let group = |group: &[u8]| {
+        let bits = group.iter().fold(0, |bits, symbol| bits << 6 | sextet(*symbol)) << (6 * (4 - group.len()));
+        bits.to_be_bytes()[1..group.len()].to_vec()
+    };
+    symbols.chunks(4).flat_map(group).collect()
+}

@@ -1,0 +1,176 @@
+//! Trials while keyframes come and go: both halves see the same data, no seed is lost, and a checkpoint holds all of it.
+
+use super::learning::{n_keyframes, options};
+use super::trials::{MAX_SCORED, TRIAL_START};
+use super::{CameraChoice, SplatOptions, SplatTrainer, TermSet, Trial};
+use crate::checkpoint::Checkpoint;
+use crate::gpu::{Gpu, GpuOptions};
+use crate::{Keyframe, Method, Split};
+use std::sync::Arc;
+
+/// Steps of each half of a trial of what all images share.
+const HALF: u64 = 250;
+const END: u64 = TRIAL_START + 2 * HALF;
+
+fn trying(gpu: &Arc<Gpu>, candidate: TermSet) -> SplatTrainer {
+    // The splat count changes with seeds alone.
+    let options = SplatOptions {
+        cameras: CameraChoice::Try(vec![candidate]),
+        growth_frac: 0.0,
+        n_planned_steps: 1500,
+        max_splats: 20_000,
+        seeds_per_image: Some(300.0),
+        ..options()
+    };
+    SplatTrainer::new(gpu.clone(), options).unwrap()
+}
+
+fn with_split(keyframe: &Arc<Keyframe>, split: Split) -> Arc<Keyframe> {
+    Arc::new(Keyframe { split, ..keyframe.as_ref().clone() })
+}
+
+/// Trains until so many updates were made in all, trials included.
+fn train_to(trainer: &mut SplatTrainer, n_taken: u64) {
+    while trainer.n_taken().unwrap() < n_taken {
+        let left = n_taken - trainer.n_taken().unwrap();
+        trainer.step(left.min(7)).unwrap();
+    }
+}
+
+fn lens() -> TermSet {
+    TermSet { lens: true, ..TermSet::default() }
+}
+
+const N_EARLY: usize = 30;
+
+/// Keyframes all around, every fourth of them held back.
+fn around(gpu: &Arc<Gpu>) -> Vec<Arc<Keyframe>> {
+    let split = |ix: usize| if ix.is_multiple_of(4) { Split::Selection } else { Split::Train };
+    n_keyframes(gpu, 46, true).iter().enumerate().map(|(ix, keyframe)| with_split(keyframe, split(ix))).collect()
+}
+
+/// Keyframes arrive before the trial, in its first half and in its second; the trial is over afterwards.
+fn trial_with_arrivals(gpu: &Arc<Gpu>, candidate: TermSet, keyframes: &[Arc<Keyframe>]) -> SplatTrainer {
+    let (early, late) = keyframes.split_at(N_EARLY);
+    let (first_half, second_half) = late.split_at(8);
+    let mut trainer = trying(gpu, candidate);
+    early.iter().for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
+    for (begin, arriving) in [(TRIAL_START, first_half), (TRIAL_START + HALF, second_half)] {
+        for (ix, keyframe) in arriving.iter().enumerate() {
+            train_to(&mut trainer, begin + 20 + 21 * ix as u64);
+            trainer.push(keyframe.clone()).unwrap();
+        }
+    }
+    train_to(&mut trainer, END + 3);
+    trainer
+}
+
+fn assert_no_seed_is_lost(trainer: &SplatTrainer, keyframes: &[Arc<Keyframe>]) {
+    assert_eq!(trainer.progress().primitives, trainer.n_seeds() as u64, "splats against places that count as seeded");
+    for keyframe in keyframes.iter().filter(|keyframe| keyframe.split == Split::Train) {
+        assert_eq!(trainer.times_learned_from(keyframe), 1, "{:?}", keyframe.stamp);
+    }
+    assert!(trainer.n_seeds() > 500, "{}", trainer.n_seeds());
+}
+
+#[test]
+fn a_change_without_effect_scores_the_same_while_keyframes_arrive() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = around(&gpu);
+    let trainer = trial_with_arrivals(&gpu, TermSet::NONE, &keyframes);
+    let [Trial { gain_db, standard_error_db, n_images, kept, .. }] = trainer.trials() else {
+        panic!("{:?}", trainer.trials())
+    };
+    assert_eq!((*gain_db, *standard_error_db, *kept), (0.0, 0.0, false));
+    assert_eq!(*n_images, N_EARLY.div_ceil(4), "those that were there when it began");
+    assert_no_seed_is_lost(&trainer, &keyframes);
+}
+
+#[test]
+fn a_change_that_is_kept_keeps_the_seeds_of_keyframes_that_arrived_meanwhile() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let wrong: Vec<_> = around(&gpu)
+        .iter()
+        .map(|keyframe| {
+            let focal_px = keyframe.focal_px.map(|focal| 1.1 * focal);
+            Arc::new(Keyframe { focal_px, ..keyframe.as_ref().clone() })
+        })
+        .collect();
+    let trainer = trial_with_arrivals(&gpu, lens(), &wrong);
+    assert!(trainer.trials().len() == 1 && trainer.trials()[0].kept, "{:?}", trainer.trials());
+    assert_no_seed_is_lost(&trainer, &wrong);
+}
+
+#[test]
+fn both_scores_of_a_trial_are_of_the_same_images() {
+    const N_FIRST: usize = 20;
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = n_keyframes(&gpu, 60, true);
+    let train = keyframes.iter().step_by(5).map(|keyframe| with_split(keyframe, Split::Train));
+    let selection: Vec<_> =
+        (0..keyframes.len()).filter(|ix| ix % 5 != 0).map(|ix| with_split(&keyframes[ix], Split::Selection)).collect();
+    let mut trainer = trying(&gpu, TermSet::NONE);
+    let (early, late) = selection.split_at(N_FIRST);
+    train.chain(early.iter().cloned()).for_each(|keyframe| trainer.push(keyframe).unwrap());
+    // More of them come than a score is the mean over, in both halves; and two of those that were scored go.
+    for (ix, keyframe) in late.iter().enumerate() {
+        train_to(&mut trainer, TRIAL_START + 10 + 24 * ix as u64);
+        trainer.push(keyframe.clone()).unwrap();
+        match ix {
+            3 => trainer.remove("test", early[2].stamp).unwrap(),
+            12 => trainer.remove("test", early[5].stamp).unwrap(),
+            _ => {}
+        }
+    }
+    assert!(selection.len() > MAX_SCORED + 4);
+    train_to(&mut trainer, END + 3);
+    let [Trial { gain_db, standard_error_db, n_images, .. }] = trainer.trials() else {
+        panic!("{:?}", trainer.trials())
+    };
+    assert_eq!((*gain_db, *standard_error_db, *n_images), (0.0, 0.0, N_FIRST - 2));
+}
+
+#[test]
+fn stopping_in_either_half_of_a_trial_changes_no_bit() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = n_keyframes(&gpu, 42, true);
+    // Steps at which keyframes arrive, and at which training stops and goes on; all count updates in all.
+    let arrivals: Vec<u64> = (0..42).map(|ix| if ix < 36 { 0 } else { TRIAL_START - 60 + 120 * (ix - 35) }).collect();
+    let stops = [TRIAL_START - 10, TRIAL_START + 70, TRIAL_START + HALF + 30, TRIAL_START + HALF + 140, END + 20];
+    let run = |stops: &[u64]| {
+        let mut trainer = trying(&gpu, lens());
+        let mut n_taken_before = 0; // Updates that a trial took back are not in a checkpoint.
+        let mut n_pushed = 0;
+        let times: std::collections::BTreeSet<u64> = arrivals.iter().chain(stops).copied().chain([END + 40]).collect();
+        for time in times {
+            train_to(&mut trainer, time - n_taken_before);
+            while n_pushed < arrivals.len() && arrivals[n_pushed] <= time {
+                trainer.push(keyframes[n_pushed].clone()).unwrap();
+                n_pushed += 1;
+            }
+            if stops.contains(&time) {
+                let checkpoint = trainer.checkpoint().unwrap().finish().unwrap();
+                let bytes_of_other = checkpoint.arrays.iter().filter(|array| array.name.starts_with("other_")).count();
+                let is_in_trial = (TRIAL_START..END).contains(&time);
+                assert_eq!(bytes_of_other > 0, is_in_trial, "at {time}");
+                let rest;
+                (trainer, rest) = SplatTrainer::resume(gpu.clone(), &checkpoint, &keyframes[..n_pushed]).unwrap();
+                rest.into_iter().for_each(|keyframe| trainer.push(keyframe).unwrap());
+                n_taken_before = time - trainer.n_taken().unwrap();
+            }
+        }
+        let trials = trainer.trials().to_vec();
+        assert_eq!(trials.len(), 1);
+        (trials, taken(&mut trainer))
+    };
+    let (whole, parts) = (run(&[]), run(&stops));
+    assert_eq!(whole.0, parts.0);
+    assert_eq!(whole.1.state, parts.1.state);
+    for (one, other) in whole.1.arrays.iter().zip(&parts.1.arrays) {
+        assert!(one == other, "{} differ", one.name);
+    }
+}
+
+fn taken(trainer: &mut SplatTrainer) -> Checkpoint {
+    trainer.checkpoint().unwrap().finish().unwrap()
+}

@@ -1,0 +1,52 @@
+//! Files that are whole or not there.
+
+use crate::Error;
+use std::fs::File;
+use std::path::{Path, PathBuf};
+
+/// The name that a file has while it is written: `.part` follows its own.
+pub fn partial_path(path: &Path) -> PathBuf {
+    let mut partial = path.as_os_str().to_owned();
+    partial.push(".part");
+    partial.into()
+}
+
+/// Writes a file beside its place, waits until the disk has it, and moves it there: whatever happens, either the previous file or
+/// this one is under the name, whole. A partial file is removed after an error.
+pub(crate) fn write(path: &Path, contents: impl FnOnce(&mut File) -> std::io::Result<()>) -> Result<(), Error> {
+    let partial = partial_path(path);
+    let written = File::create(&partial).and_then(|mut file| {
+        contents(&mut file)?;
+        file.sync_all()?;
+        std::fs::rename(&partial, path)?;
+        // The new name is on the disk only when its folder is.
+        match path.parent() {
+            Some(folder) if !folder.as_os_str().is_empty() => File::open(folder)?.sync_all(),
+            _ => File::open(".")?.sync_all(),
+        }
+    });
+    if written.is_err() {
+        let _ = std::fs::remove_file(&partial); // It is of no use, and others may need its room.
+    }
+    written.map_err(|source| Error::Write { path: path.to_owned(), source })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io::Write;
+
+    #[test]
+    fn a_failed_write_keeps_the_previous_file_and_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("scene.ply");
+        write(&path, |file| file.write_all(b"first")).unwrap();
+        let failed = write(&path, |file| {
+            file.write_all(b"sec")?;
+            Err(std::io::ErrorKind::StorageFull.into())
+        });
+        assert!(matches!(failed, Err(Error::Write { path: named, .. }) if named == path));
+        assert_eq!(std::fs::read(&path).unwrap(), b"first");
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+}

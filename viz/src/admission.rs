@@ -1,0 +1,519 @@
+//! Which connections may stay open: few enough to leave file descriptors for everything else, and those that are used.
+//!
+//! All peers have a loopback address, so nothing but their behavior separates a viewer from a socket that is only open.
+//! Where a limit is reached, the connection that does least gives way to the new one.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::pin::Pin;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Poll, Waker};
+use std::time::{Duration, Instant};
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::net::TcpStream;
+
+/// Open connections, where the limit on open files does not ask for fewer.
+const MAX_CONNECTIONS: usize = 256;
+/// WebSocket clients at a time.
+const MAX_CLIENTS: usize = 32;
+/// Connections take at most this share of the files that the process may open.
+const DESCRIPTOR_SHARE: usize = 4;
+/// A connection whose peer takes no byte for this long is closed.
+const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
+/// An HTTP connection without a new request for this long is closed.
+const IDLE_TIMEOUT: Duration = Duration::from_secs(10);
+/// A client that answers no ping for this long is disconnected.
+const PONG_TIMEOUT: Duration = Duration::from_secs(8);
+/// A client that has not answered a ping for this long gives up its seat to a new one.
+const UNRESPONSIVE_AFTER: Duration = Duration::from_secs(1);
+/// A client that has sent no message for this long gives up its seat to a new one; the page sends two a second.
+const IDLE_CLIENT_AFTER: Duration = Duration::from_secs(3);
+
+/// How many connections there may be.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Limits {
+    /// Open connections.
+    pub(crate) connections: usize,
+    /// WebSocket clients among them.
+    pub(crate) clients: usize,
+}
+
+impl Limits {
+    /// The limits for a process that may open this many files.
+    pub(crate) fn of_descriptors(n_descriptors: usize) -> Self {
+        let connections = (n_descriptors / DESCRIPTOR_SHARE).clamp(8, MAX_CONNECTIONS);
+        Self { connections, clients: MAX_CLIENTS.min(connections / 2) }
+    }
+
+    /// The limits for this process.
+    pub(crate) fn of_process() -> Self {
+        Self::of_descriptors(max_descriptors())
+    }
+}
+
+#[cfg(unix)]
+fn max_descriptors() -> usize {
+    let limit = rustix::process::getrlimit(rustix::process::Resource::Nofile).current;
+    limit.map_or(usize::MAX, |limit| usize::try_from(limit).unwrap_or(usize::MAX))
+}
+
+#[cfg(not(unix))]
+fn max_descriptors() -> usize {
+    usize::MAX
+}
+
+/// All open connections.
+#[derive(Debug)]
+pub(crate) struct Admission {
+    limits: Limits,
+    registry: Mutex<Registry>,
+}
+
+#[derive(Debug, Default)]
+struct Registry {
+    connections: BTreeMap<u64, Arc<Connection>>,
+    n_opened: u64,
+}
+
+/// One open connection, from accept to close.
+#[derive(Debug)]
+pub(crate) struct Connection {
+    number: u64,
+    state: Mutex<State>,
+}
+
+#[derive(Debug)]
+struct State {
+    /// Reads and writes fail from now on.
+    is_closed: bool,
+    reader: Option<Waker>,
+    writer: Option<Waker>,
+    /// Since when a write has been waiting for the peer to read.
+    blocked_since: Option<Instant>,
+    /// When the last request was complete; `None` before the first.
+    requested: Option<Instant>,
+    opened: Instant,
+    /// Set once it has a WebSocket client's seat.
+    client: Option<Client>,
+}
+
+#[derive(Debug)]
+struct Client {
+    seated: Instant,
+    /// When it sent its last message; pongs do not count, any library sends them.
+    spoke: Option<Instant>,
+    /// When a ping was sent that it has not answered.
+    pinged: Option<Instant>,
+    /// Whether it has ever answered one, which shows that it reads.
+    has_answered: bool,
+}
+
+/// How dispensable a client is: unresponsive before never in use before idle, then the longest.
+type Dispensability = (u8, Duration);
+
+impl Admission {
+    /// No connections yet.
+    pub(crate) fn new(limits: Limits) -> Arc<Self> {
+        Arc::new(Self { limits, registry: Mutex::default() })
+    }
+
+    /// Adds an accepted connection; returns whether another one was closed for it.
+    pub(crate) fn admit(self: &Arc<Self>, stream: TcpStream) -> (GuardedStream, bool) {
+        let has_evicted = self.registry().connections.len() >= self.limits.connections && self.evict();
+        let mut registry = self.registry();
+        registry.n_opened += 1;
+        let connection = Arc::new(Connection::new(registry.n_opened));
+        registry.connections.insert(connection.number, Arc::clone(&connection));
+        drop(registry);
+        (GuardedStream { stream, connection, admission: Arc::clone(self) }, has_evicted)
+    }
+
+    /// Closes the connection without a client that has been of no use for longest; half-open requests come first.
+    pub(crate) fn evict(&self) -> bool {
+        let registry = self.registry();
+        let candidates = registry.connections.values().filter_map(|connection| {
+            let state = connection.state();
+            let is_candidate = !state.is_closed && state.client.is_none();
+            is_candidate.then_some((state.requested.is_some(), state.requested.unwrap_or(state.opened), connection))
+        });
+        let oldest = candidates.min_by_key(|(has_requested, since, _)| (*has_requested, *since));
+        oldest.inspect(|(.., connection)| connection.close("its place is needed")).is_some()
+    }
+
+    /// Seats a WebSocket client on its connection. Where all seats are taken, the most dispensable client loses its own.
+    pub(crate) fn seat(&self, connection: &Connection) -> bool {
+        // Held until the seat is taken, so that two clients never count the same seat.
+        let registry = self.registry();
+        let now = Instant::now();
+        let seated = registry.connections.values().filter(|other| other.has_seat());
+        let (mut n_seated, mut worst): (usize, Option<(Dispensability, &Arc<Connection>)>) = (0, None);
+        for other in seated {
+            n_seated += 1;
+            if let Some(dispensability) = other.dispensability(now)
+                && worst.is_none_or(|(most, _)| dispensability > most)
+            {
+                worst = Some((dispensability, other));
+            }
+        }
+        if n_seated >= self.limits.clients {
+            let Some((_, other)) = worst else { return false };
+            other.close("a new client needs its seat");
+        }
+        connection.state().client = Some(Client { seated: now, spoke: None, pinged: None, has_answered: false });
+        true
+    }
+
+    /// Closes connections whose peers have stopped to read, to ask or to answer.
+    pub(crate) fn sweep(&self) {
+        let now = Instant::now();
+        for connection in self.registry().connections.values() {
+            if let Some(reason) = connection.overdue(now) {
+                connection.close(reason);
+            }
+        }
+    }
+
+    /// How many connections are open.
+    #[cfg(test)]
+    fn n_open(&self) -> usize {
+        self.registry().connections.len()
+    }
+
+    /// The registry holds plain values that are valid after every statement, so a panic elsewhere spoils nothing.
+    fn registry(&self) -> MutexGuard<'_, Registry> {
+        self.registry.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Connection {
+    fn new(number: u64) -> Self {
+        let state = State {
+            is_closed: false,
+            reader: None,
+            writer: None,
+            blocked_since: None,
+            requested: None,
+            opened: Instant::now(),
+            client: None,
+        };
+        Self { number, state: Mutex::new(state) }
+    }
+
+    /// A request has arrived completely.
+    pub(crate) fn requested(&self) {
+        self.state().requested = Some(Instant::now());
+    }
+
+    /// The client has sent a message.
+    pub(crate) fn spoke(&self) {
+        if let Some(client) = &mut self.state().client {
+            client.spoke = Some(Instant::now());
+        }
+    }
+
+    /// Whether a ping is due: at most one waits for its answer.
+    pub(crate) fn take_ping(&self) -> bool {
+        match &mut self.state().client {
+            Some(client) if client.pinged.is_none() => {
+                client.pinged = Some(Instant::now());
+                true
+            }
+            _ => false,
+        }
+    }
+
+    /// The client has answered a ping, so it reads.
+    pub(crate) fn answered_ping(&self) {
+        if let Some(client) = &mut self.state().client {
+            client.pinged = None;
+            client.has_answered = true;
+        }
+    }
+
+    fn has_seat(&self) -> bool {
+        let state = self.state();
+        state.client.is_some() && !state.is_closed
+    }
+
+    /// `None` for a client that is in use.
+    fn dispensability(&self, now: Instant) -> Option<Dispensability> {
+        let state = self.state();
+        let client = state.client.as_ref()?;
+        let stuck_for = [client.pinged, state.blocked_since].into_iter().flatten().map(|since| now - since).max();
+        if let Some(stuck_for) = stuck_for.filter(|time| *time >= UNRESPONSIVE_AFTER) {
+            return Some((2, stuck_for));
+        }
+        match client.spoke.filter(|_| client.has_answered) {
+            None => Some((1, now - client.seated)),
+            Some(spoke) if now - spoke >= IDLE_CLIENT_AFTER => Some((0, now - spoke)),
+            Some(_) => None,
+        }
+    }
+
+    /// Why the connection is to be closed now, if it is.
+    fn overdue(&self, now: Instant) -> Option<&'static str> {
+        let state = self.state();
+        let is_over = |since: Option<Instant>, timeout| since.is_some_and(|since| now - since > timeout);
+        if is_over(state.blocked_since, WRITE_TIMEOUT) {
+            return Some("its peer does not read");
+        }
+        match &state.client {
+            Some(client) => is_over(client.pinged, PONG_TIMEOUT).then_some("it does not answer pings"),
+            None => {
+                let idle_since = Some(state.requested.unwrap_or(state.opened));
+                is_over(idle_since, IDLE_TIMEOUT).then_some("it has been idle for too long")
+            }
+        }
+    }
+
+    /// Makes all reads and writes fail, so that whoever serves the connection drops it.
+    fn close(&self, reason: &str) {
+        let mut state = self.state();
+        if state.is_closed {
+            return;
+        }
+        log::debug!("connection {} is closed: {reason}", self.number);
+        state.is_closed = true;
+        let wakers = [state.reader.take(), state.writer.take()];
+        drop(state);
+        wakers.into_iter().flatten().for_each(Waker::wake);
+    }
+
+    /// See [`Admission::registry`].
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// A TCP stream that [`Admission`] can close, and that leaves it when dropped.
+#[derive(Debug)]
+pub(crate) struct GuardedStream {
+    stream: TcpStream,
+    connection: Arc<Connection>,
+    admission: Arc<Admission>,
+}
+
+impl GuardedStream {
+    /// Its entry in the [`Admission`].
+    pub(crate) fn connection(&self) -> &Arc<Connection> {
+        &self.connection
+    }
+
+    /// Runs a write unless the connection is closed, and notes whether the peer reads.
+    fn write(
+        &mut self,
+        context: &mut Context<'_>,
+        write: impl FnOnce(Pin<&mut TcpStream>, &mut Context<'_>) -> Poll<io::Result<usize>>,
+    ) -> Poll<io::Result<usize>> {
+        if self.connection.state().is_closed {
+            return Poll::Ready(Err(io::ErrorKind::ConnectionAborted.into()));
+        }
+        let written = write(Pin::new(&mut self.stream), context);
+        let mut state = self.connection.state();
+        match &written {
+            Poll::Pending => {
+                state.blocked_since.get_or_insert_with(Instant::now);
+                state.writer = Some(context.waker().clone());
+            }
+            Poll::Ready(_) => state.blocked_since = None,
+        }
+        drop(state);
+        written
+    }
+}
+
+impl AsyncRead for GuardedStream {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        if self.connection.state().is_closed {
+            return Poll::Ready(Err(io::ErrorKind::ConnectionAborted.into()));
+        }
+        let read = Pin::new(&mut self.stream).poll_read(context, buffer);
+        if read.is_pending() {
+            self.connection.state().reader = Some(context.waker().clone());
+        }
+        read
+    }
+}
+
+impl AsyncWrite for GuardedStream {
+    fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        self.write(context, |stream, context| stream.poll_write(context, bytes))
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        slices: &[io::IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        self.write(context, |stream, context| stream.poll_write_vectored(context, slices))
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        self.stream.is_write_vectored()
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_flush(context)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_shutdown(context)
+    }
+}
+
+impl Drop for GuardedStream {
+    fn drop(&mut self) {
+        if self.connection.state().is_closed {
+            // What the peer did not read is discarded, else the kernel would keep it for minutes.
+            if let Err(error) = self.stream.set_zero_linger() {
+                log::debug!("cannot discard unread bytes: {error}");
+            }
+        }
+        self.admission.registry().connections.remove(&self.connection.number);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Admission, GuardedStream, IDLE_CLIENT_AFTER, Limits, PONG_TIMEOUT, UNRESPONSIVE_AFTER, WRITE_TIMEOUT};
+    use std::sync::Arc;
+    use std::time::{Duration, Instant};
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    use tokio::net::TcpStream;
+
+    const LIMITS: Limits = Limits { connections: 4, clients: 2 };
+
+    /// Admission, and a port where both ends of connections are made.
+    struct Port {
+        admission: Arc<Admission>,
+        listener: std::net::TcpListener,
+    }
+
+    impl Port {
+        fn open() -> Self {
+            let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port exists");
+            Self { admission: Admission::new(LIMITS), listener }
+        }
+
+        /// Both ends of a new connection.
+        fn connect(&self) -> (GuardedStream, TcpStream) {
+            let address = self.listener.local_addr().expect("bound");
+            let peer = std::net::TcpStream::connect(address).expect("it listens");
+            let (stream, _) = self.listener.accept().expect("a peer waits");
+            for stream in [&peer, &stream] {
+                stream.set_nonblocking(true).expect("a socket");
+            }
+            let stream = TcpStream::from_std(stream).expect("a runtime");
+            (self.admission.admit(stream).0, TcpStream::from_std(peer).expect("a runtime"))
+        }
+    }
+
+    fn run(test: impl Future<Output = ()>) {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+        runtime.expect("a runtime").block_on(test);
+    }
+
+    /// Does what a page does as soon as it is connected.
+    fn use_client(stream: &GuardedStream) {
+        stream.connection().spoke();
+        assert!(stream.connection().take_ping());
+        stream.connection().answered_ping();
+    }
+
+    fn is_closed(stream: &GuardedStream) -> bool {
+        stream.connection().state().is_closed
+    }
+
+    #[test]
+    fn connections_leave_descriptors_for_files() {
+        assert_eq!(Limits::of_descriptors(1024), Limits { connections: 256, clients: 32 });
+        assert_eq!(Limits::of_descriptors(1_000_000), Limits { connections: 256, clients: 32 });
+        assert_eq!(Limits::of_descriptors(128), Limits { connections: 32, clients: 16 });
+        assert_eq!(Limits::of_descriptors(16), Limits { connections: 8, clients: 4 });
+    }
+
+    #[test]
+    fn the_oldest_half_open_request_gives_way() {
+        run(async {
+            let port = Port::open();
+            let (served, _a) = port.connect();
+            served.connection().requested();
+            let (mut half_open, _b) = port.connect();
+            let (_newer, _c) = port.connect();
+            let (_newest, _d) = port.connect();
+            let (_one_more, _e) = port.connect();
+            assert!(is_closed(&half_open) && !is_closed(&served));
+            assert!(half_open.read_u8().await.is_err(), "whoever serves it sees the end");
+            drop(half_open);
+            assert_eq!(port.admission.n_open(), 4);
+        });
+    }
+
+    #[test]
+    fn seats_are_counted_and_given_back() {
+        run(async {
+            let port = Port::open();
+            let (a, _a) = port.connect();
+            let (b, _b) = port.connect();
+            let (c, _c) = port.connect();
+            for stream in [&a, &b] {
+                assert!(port.admission.seat(stream.connection()));
+                use_client(stream);
+            }
+            assert!(!port.admission.seat(c.connection()), "both are in use");
+            drop(a);
+            assert!(port.admission.seat(c.connection()));
+            assert!(!is_closed(&b));
+        });
+    }
+
+    #[test]
+    fn the_most_dispensable_client_loses_its_seat() {
+        run(async {
+            let port = Port::open();
+            let (speaking, _a) = port.connect();
+            let (other, _b) = port.connect();
+            let (newcomer, _c) = port.connect();
+            assert!(port.admission.seat(speaking.connection()) && port.admission.seat(other.connection()));
+            use_client(&speaking);
+            other.connection().spoke(); // It does not read.
+            assert!(port.admission.seat(newcomer.connection()), "the other never answered a ping");
+            assert!(is_closed(&other) && !is_closed(&speaking));
+
+            let now = Instant::now();
+            let connection = speaking.connection();
+            assert_eq!(connection.dispensability(now), None);
+            let idle = connection.dispensability(now + IDLE_CLIENT_AFTER).expect("idle");
+            let silent = newcomer.connection().dispensability(now).expect("silent");
+            assert!(connection.take_ping() && !connection.take_ping(), "one ping at a time");
+            let unresponsive = connection.dispensability(Instant::now() + UNRESPONSIVE_AFTER).expect("unresponsive");
+            assert!(idle < silent && silent < unresponsive);
+            connection.answered_ping();
+            assert_eq!(connection.dispensability(now), None);
+        });
+    }
+
+    #[test]
+    fn peers_that_do_not_read_or_answer_are_overdue() {
+        run(async {
+            let port = Port::open();
+            let (mut stuck, _a) = port.connect();
+            let filling = async { while stuck.write_all(&[0; 65536]).await.is_ok() {} };
+            assert!(tokio::time::timeout(Duration::from_millis(500), filling).await.is_err(), "the peer never reads");
+            let soon = Instant::now() + Duration::from_millis(100);
+            assert_eq!(stuck.connection().overdue(soon), None);
+            assert!(stuck.connection().overdue(soon + WRITE_TIMEOUT).is_some());
+
+            let (client, _b) = port.connect();
+            assert!(port.admission.seat(client.connection()) && client.connection().take_ping());
+            assert_eq!(client.connection().overdue(soon), None);
+            assert!(client.connection().overdue(soon + PONG_TIMEOUT).is_some());
+            client.connection().answered_ping();
+            assert_eq!(client.connection().overdue(soon + 2 * PONG_TIMEOUT), None, "a quiet client may stay");
+        });
+    }
+}

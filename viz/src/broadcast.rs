@@ -1,0 +1,251 @@
+//! Encodes what is new once for all clients, away from their sessions.
+
+use crate::Hub;
+use crate::clock::ServerClock;
+use crate::news::LiveImage;
+use crate::picture::pack_live_image;
+use crate::protocol::{KeyframeMessage, ServerMessage};
+use axum::extract::ws::Message;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+
+/// How often the hub is checked for something new.
+const CHECK_PERIOD: Duration = Duration::from_millis(20);
+/// A status goes out at most this often, and so do the images of a camera.
+const NEWS_PERIOD: Duration = Duration::from_millis(190);
+/// The list of keyframes goes out at most this often: it is long, and it is sent whole.
+const KEYFRAMES_PERIOD: Duration = Duration::from_secs(1);
+
+/// The latest encoded message of each kind.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Bulletin {
+    scene: Option<Item>,
+    status: Option<Item>,
+    keyframes: Option<Item>,
+    live_images: BTreeMap<Arc<str>, Item>,
+}
+
+/// An encoded message; clones share the bytes.
+#[derive(Clone, Debug)]
+struct Item {
+    number: u64,
+    message: Message,
+}
+
+/// Numbers of the items that a client has received.
+#[derive(Debug, Default)]
+pub(crate) struct Received {
+    scene: u64,
+    status: u64,
+    keyframes: u64,
+    live_images: BTreeMap<Arc<str>, u64>,
+}
+
+impl Bulletin {
+    /// The next message that a client has not received: short ones first, and only those unless `long` ones may go too.
+    pub(crate) fn next(&self, received: &mut Received, long: bool) -> Option<Message> {
+        let newer = |item: &Option<Item>, number: &mut u64| {
+            let item = item.as_ref().filter(|item| item.number > *number)?;
+            *number = item.number;
+            Some(item.message.clone())
+        };
+        let short = newer(&self.scene, &mut received.scene).or_else(|| newer(&self.status, &mut received.status));
+        if short.is_some() || !long {
+            return short;
+        }
+        // The camera whose last image went out first comes first.
+        let number_of = |camera: &Arc<str>| received.live_images.get(camera).copied().unwrap_or(0);
+        let waiting = self.live_images.iter().filter(|(camera, item)| item.number > number_of(camera));
+        let image = waiting.min_by_key(|(camera, _)| number_of(camera));
+        if let Some((camera, item)) = image {
+            received.live_images.insert(Arc::clone(camera), item.number);
+            return Some(item.message.clone());
+        }
+        newer(&self.keyframes, &mut received.keyframes)
+    }
+
+    fn is_empty(&self) -> bool {
+        self.scene.is_none() && self.status.is_none() && self.keyframes.is_none() && self.live_images.is_empty()
+    }
+}
+
+/// What a finished encoding is of.
+enum Encoded {
+    Keyframes(Message),
+    LiveImage(Arc<str>, Message),
+}
+
+/// The image of a camera that was encoded last, or is being encoded.
+struct Begun {
+    image: Arc<LiveImage>,
+    at: Instant,
+    is_running: bool,
+}
+
+/// Encodes news while there are clients; runs until the server stops.
+pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, bulletin: watch::Sender<Bulletin>) {
+    let (mut scene, mut status, mut keyframes, live_images) =
+        (hub.scene(), hub.status(), hub.keyframes(), hub.live_images());
+    // A client may come before the first check, and what was set earlier is new to it.
+    scene.mark_changed();
+    status.mark_changed();
+    keyframes.mark_changed();
+    let mut status_sent = Throttle::new(NEWS_PERIOD);
+    let mut keyframes_sent = Throttle::new(KEYFRAMES_PERIOD);
+    let mut begun: BTreeMap<Arc<str>, Begun> = BTreeMap::new();
+    let mut encodings: JoinSet<Encoded> = JoinSet::new();
+    let mut is_encoding_keyframes = false;
+    let mut n_items = 0;
+    let mut publish = |change: &dyn Fn(&mut Bulletin, u64)| {
+        n_items += 1;
+        bulletin.send_modify(|bulletin| change(bulletin, n_items));
+    };
+    let mut check = tokio::time::interval(CHECK_PERIOD);
+    check.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    loop {
+        tokio::select! {
+            _ = check.tick() => {}
+            Some(encoded) = encodings.join_next() => match encoded {
+                Ok(Encoded::Keyframes(message)) => {
+                    is_encoding_keyframes = false;
+                    publish(&|bulletin, number| bulletin.keyframes = Some(Item { number, message: message.clone() }));
+                }
+                Ok(Encoded::LiveImage(camera, message)) => {
+                    if let Some(begun) = begun.get_mut(&camera) {
+                        begun.is_running = false;
+                    }
+                    publish(&|bulletin, number| {
+                        bulletin.live_images.insert(Arc::clone(&camera), Item { number, message: message.clone() });
+                    });
+                }
+                Err(error) => log::error!("encoding news failed: {error}"),
+            },
+        }
+        if hub.n_clients() == 0 {
+            if !bulletin.borrow().is_empty() {
+                bulletin.send_replace(Bulletin::default());
+            }
+            // The next client gets everything.
+            scene.mark_changed();
+            status.mark_changed();
+            keyframes.mark_changed();
+            begun.retain(|_, begun| begun.is_running);
+            status_sent.reset();
+            keyframes_sent.reset();
+            continue;
+        }
+        if let Some(hint) = fresh(&mut scene).flatten() {
+            let message = text(&ServerMessage::from(&*hint));
+            publish(&|bulletin, number| bulletin.scene = Some(Item { number, message: message.clone() }));
+        }
+        if status_sent.is_due()
+            && let Some(latest) = fresh(&mut status).flatten()
+        {
+            status_sent.begin();
+            let message = text(&ServerMessage::Status(&latest));
+            publish(&|bulletin, number| bulletin.status = Some(Item { number, message: message.clone() }));
+        }
+        if keyframes_sent.is_due()
+            && !is_encoding_keyframes
+            && let Some(list) = fresh(&mut keyframes)
+        {
+            keyframes_sent.begin();
+            is_encoding_keyframes = true;
+            encodings.spawn_blocking(move || {
+                let keyframes = list.iter().map(KeyframeMessage::from).collect();
+                Encoded::Keyframes(text(&ServerMessage::Keyframes { keyframes }))
+            });
+        }
+        for (camera, image) in &*live_images.borrow() {
+            let is_new = begun.get(camera).is_none_or(|begun| {
+                !begun.is_running && begun.at.elapsed() >= NEWS_PERIOD && !Arc::ptr_eq(&begun.image, image)
+            });
+            if is_new {
+                let (camera, image) = (Arc::clone(camera), Arc::clone(image));
+                let entry = Begun { image: Arc::clone(&image), at: Instant::now(), is_running: true };
+                begun.insert(Arc::clone(&camera), entry);
+                encodings.spawn_blocking(move || {
+                    let message = live_message(&image, clock);
+                    Encoded::LiveImage(camera, message)
+                });
+            }
+        }
+    }
+}
+
+fn live_message(image: &LiveImage, clock: ServerClock) -> Message {
+    match pack_live_image(image, clock) {
+        Ok(bytes) => Message::binary(bytes),
+        Err(error) => {
+            let message = format!("live image of camera {:?}: {error}", image.camera);
+            text(&ServerMessage::Error { id: None, message: &message })
+        }
+    }
+}
+
+fn text(message: &ServerMessage<'_>) -> Message {
+    Message::text(message.to_json())
+}
+
+/// The value, if it changed since the last call. An error would mean that the hub is gone, which outlives the server.
+fn fresh<T: Clone>(receiver: &mut watch::Receiver<T>) -> Option<T> {
+    receiver.has_changed().unwrap_or(false).then(|| receiver.borrow_and_update().clone())
+}
+
+/// Lets something happen at most once a period.
+struct Throttle {
+    period: Duration,
+    last: Option<Instant>,
+}
+
+impl Throttle {
+    fn new(period: Duration) -> Self {
+        Self { period, last: None }
+    }
+
+    fn is_due(&self) -> bool {
+        self.last.is_none_or(|last| last.elapsed() >= self.period)
+    }
+
+    fn begin(&mut self) {
+        self.last = Some(Instant::now());
+    }
+
+    fn reset(&mut self) {
+        self.last = None;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Bulletin, Item, Received};
+    use axum::extract::ws::Message;
+
+    fn item(number: u64) -> Item {
+        Item { number, message: Message::text(number.to_string()) }
+    }
+
+    fn next(bulletin: &Bulletin, received: &mut Received, long: bool) -> Option<String> {
+        bulletin.next(received, long).map(|message| message.into_text().expect("text").to_string())
+    }
+
+    #[test]
+    fn short_messages_go_first_and_cameras_in_turn() {
+        let mut bulletin = Bulletin { scene: Some(item(1)), status: Some(item(4)), ..Bulletin::default() };
+        bulletin.keyframes = Some(item(2));
+        bulletin.live_images = [("left".into(), item(3)), ("right".into(), item(5))].into();
+        let mut received = Received::default();
+        assert_eq!(next(&bulletin, &mut received, false).as_deref(), Some("1"));
+        assert_eq!(next(&bulletin, &mut received, false).as_deref(), Some("4"));
+        assert_eq!(next(&bulletin, &mut received, false), None, "only long ones are left");
+        assert_eq!(next(&bulletin, &mut received, true).as_deref(), Some("3"));
+        bulletin.live_images.insert("left".into(), item(6));
+        assert_eq!(next(&bulletin, &mut received, true).as_deref(), Some("5"), "the other camera's turn");
+        assert_eq!(next(&bulletin, &mut received, true).as_deref(), Some("6"));
+        assert_eq!(next(&bulletin, &mut received, true).as_deref(), Some("2"));
+        assert_eq!(next(&bulletin, &mut received, true), None);
+    }
+}

@@ -1,0 +1,62 @@
+//! A TCP proxy whose link can be cut: connections stay open, and nothing passes until it is mended.
+
+use std::io::{Read, Write};
+use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+/// Its threads end with the process or with their connections.
+pub(crate) struct Proxy {
+    address: SocketAddr,
+    is_cut: Arc<AtomicBool>,
+}
+
+impl Proxy {
+    /// Forwards connections to `server`.
+    pub(crate) fn start(server: SocketAddr) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("a free port exists");
+        let address = listener.local_addr().expect("bound");
+        let is_cut: Arc<AtomicBool> = Arc::default();
+        let is_cut_here = Arc::clone(&is_cut);
+        std::thread::spawn(move || {
+            for client in listener.incoming().map_while(Result::ok) {
+                let Ok(server) = TcpStream::connect(server) else { continue };
+                let ends = [&client, &server].map(|stream| stream.try_clone().expect("a descriptor"));
+                let [client_too, server_too] = ends;
+                for (from, to) in [(client, server_too), (server, client_too)] {
+                    let is_cut = Arc::clone(&is_cut_here);
+                    std::thread::spawn(move || pump(from, to, &is_cut));
+                }
+            }
+        });
+        Self { address, is_cut }
+    }
+
+    pub(crate) fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    pub(crate) fn cut(&self) {
+        self.is_cut.store(true, Ordering::Relaxed);
+    }
+
+    pub(crate) fn mend(&self) {
+        self.is_cut.store(false, Ordering::Relaxed);
+    }
+}
+
+fn pump(mut from: TcpStream, mut to: TcpStream, is_cut: &AtomicBool) {
+    let mut bytes = [0; 16 * 1024];
+    loop {
+        let n = from.read(&mut bytes).unwrap_or(0);
+        while is_cut.load(Ordering::Relaxed) {
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        if n == 0 || to.write_all(&bytes[..n]).is_err() {
+            // Closing an end that the other side has closed already fails, and need not succeed.
+            let _ = to.shutdown(Shutdown::Both);
+            return;
+        }
+    }
+}
