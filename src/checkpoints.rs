@@ -138,22 +138,32 @@ impl Checkpoints {
 
     /// Begins one of the current state, after the one under way.
     pub(crate) fn begin(&mut self, now: Snapshot<'_>) -> Result<(), trainer::Error> {
+        let job = self.take(now)?;
+        self.write(job);
+        Ok(())
+    }
+
+    /// Copies the current state, to be written later.
+    pub(crate) fn take(&mut self, now: Snapshot<'_>) -> Result<Job, trainer::Error> {
         self.wait_and_warn();
         let asked = Instant::now();
         let pending = now.method.checkpoint()?;
         log::debug!("a checkpoint held training up for {:?}", asked.elapsed());
-        let job = Job {
+        Ok(Job {
             pending,
             seconds: now.seconds,
             is_finished: now.is_finished,
             run_flags: self.run_flags.clone(),
             path: self.path.clone(),
             keyframes: self.kept_keyframes.clone().map(|kept| (kept, now.keyframes.to_vec())),
-        };
+        })
+    }
+
+    /// Writes a copy on a thread of its own.
+    pub(crate) fn write(&mut self, job: Job) {
         let thread = std::thread::spawn(move || job.write());
         self.writing = Some(Writing { thread, is_checkpoint: true });
         (self.last, self.last_keyframes) = (Instant::now(), Instant::now());
-        Ok(())
     }
 
     fn wait_and_warn(&mut self) {
@@ -185,7 +195,7 @@ impl Checkpoints {
 }
 
 /// A checkpoint on its way to the disk.
-struct Job {
+pub(crate) struct Job {
     pending: PendingCheckpoint,
     seconds: f64,
     is_finished: bool,

@@ -701,15 +701,24 @@ impl Session {
         if self.method.progress().primitives == 0 {
             log::warn!("the model is empty: nothing that was seen could be used");
         }
+        // Saving ends a trial that is under way; the checkpoint is of the state before it, so that a resumed run ends it when it is due.
+        let is_finished = self.is_over() || self.is_idle();
+        let (method, keyframes) = (self.method.as_mut(), &self.keyframes[..]);
+        let snapshot = Snapshot { method, keyframes, seconds, is_finished };
+        let checkpoint = match self.checkpoints.as_mut().map(|checkpoints| checkpoints.take(snapshot)).transpose() {
+            Ok(checkpoint) => checkpoint,
+            Err(error) => {
+                log::warn!("no checkpoint of the last state: {error:#}"); // The model matters more.
+                None
+            }
+        };
         let saved = match run_folder::save_model(self.method.as_mut(), out) {
             Ok(()) => Saved { folder: out.to_owned(), sha256: run_folder::checkpoint_sha256(out)?, failed: None },
             Err(error) if exit::is_io(&error) => self.save_elsewhere(out, error)?,
             Err(error) => return Err(error),
         };
-        let is_finished = self.is_over() || self.is_idle();
-        if let (Some(checkpoints), None) = (&mut self.checkpoints, &saved.failed) {
-            let (method, keyframes) = (self.method.as_mut(), &self.keyframes[..]);
-            checkpoints.begin(Snapshot { method, keyframes, seconds, is_finished })?;
+        if let (Some(checkpoints), Some(checkpoint), None) = (&mut self.checkpoints, checkpoint, &saved.failed) {
+            checkpoints.write(checkpoint);
         }
         Ok(saved)
     }

@@ -1,31 +1,13 @@
 //! A GPU that is lost in the middle of a run, and one without memory: the run continues, or stops with what it has.
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
-use serde_json::{Value, json};
+mod photos;
+
+use photos::dataset;
+use serde_json::Value;
 use std::path::Path;
 use std::process::{Command, Output};
 use trainer::checkpoint::Checkpoint;
-
-const SIZE_PX: [u32; 2] = [64, 48];
-
-/// Ten photos of a patterned wall, taken from places in a row.
-fn dataset(folder: &Path) {
-    std::fs::create_dir(folder).unwrap();
-    let mut frames = Vec::new();
-    for ix in 0..10 {
-        let name = format!("{ix:03}.png");
-        let shade = |x: u32, y: u32| u8::try_from((x / 8 + y / 8 + ix) % 2 * 150 + x).unwrap();
-        let photo = image::RgbImage::from_fn(SIZE_PX[0], SIZE_PX[1], |x, y| {
-            image::Rgb([shade(x, y), shade(y, x), u8::try_from(5 * y).unwrap()])
-        });
-        photo.save(folder.join(&name)).unwrap();
-        let x = 0.05 * f64::from(ix);
-        let pose = [[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 1.0, 2.0], [0.0, 0.0, 0.0, 1.0]];
-        frames.push(json!({ "file_path": name, "transform_matrix": pose }));
-    }
-    let lens = json!({ "w": 64, "h": 48, "fl_x": 60.0, "fl_y": 60.0, "cx": 32.0, "cy": 24.0, "frames": frames });
-    std::fs::write(folder.join("transforms.json"), lens.to_string()).unwrap();
-}
 
 fn fieldrig(folder: &Path, args: &[&str], env: &[(&str, &str)]) -> Output {
     let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
@@ -52,24 +34,21 @@ fn a_training_that_loses_its_gpu_ends_with_the_bits_of_one_that_does_not() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     dataset(&folder.join("data"));
-    for (method, steps, lost_at, more) in [("splat", "300", "150", ["--max-splats", "600"])] {
-        let train = |out: &str, checkpoint_secs: &str, env: &[(&str, &str)]| {
-            let args = ["train", "data", "--json", "--steps", steps, "--method", method, "--out", out];
-            fieldrig(folder, &[&args[..], &["--checkpoint-secs", checkpoint_secs], &more].concat(), env)
-        };
-        let out = |name: &str| format!("{method}-{name}");
-        let whole = done(&train(&out("whole"), "60", &[]));
-        for (name, checkpoint_secs, continues_from) in
-            [("early", "100000", "from the start"), ("late", "0.1", "from the checkpoint of step")]
-        {
-            let lost = train(&out(name), checkpoint_secs, &[("FIELDRIG_TEST_LOSE_GPU_AT_STEP", lost_at)]);
-            let text = stderr(&lost);
-            assert!(text.contains("attempt 1 of 3") && text.contains(continues_from), "{text}");
-            assert!(!text.contains("attempt 2"), "{text}");
-            let lost = done(&lost);
-            assert_eq!(lost["checkpoint_sha256"], whole["checkpoint_sha256"], "{method}, {name}: {text}");
-            assert_eq!(lost["steps"], whole["steps"]);
-        }
+    let train = |out: &str, checkpoint_secs: &str, env: &[(&str, &str)]| {
+        let args = ["train", "data", "--json", "--steps", "300", "--max-splats", "600", "--out", out];
+        fieldrig(folder, &[&args[..], &["--checkpoint-secs", checkpoint_secs]].concat(), env)
+    };
+    let whole = done(&train("whole", "60", &[]));
+    for (name, checkpoint_secs, continues_from) in
+        [("early", "100000", "from the start"), ("late", "0.1", "from the checkpoint of step")]
+    {
+        let lost = train(name, checkpoint_secs, &[("FIELDRIG_TEST_LOSE_GPU_AT_STEP", "150")]);
+        let text = stderr(&lost);
+        assert!(text.contains("attempt 1 of 3") && text.contains(continues_from), "{text}");
+        assert!(!text.contains("attempt 2"), "{text}");
+        let lost = done(&lost);
+        assert_eq!(lost["checkpoint_sha256"], whole["checkpoint_sha256"], "{name}: {text}");
+        assert_eq!(lost["steps"], whole["steps"]);
     }
 }
 

@@ -1,8 +1,10 @@
 //! `fieldrig train --resume`: runs that stopped, or were killed, go on as if they had not.
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
+mod photos;
 mod small_rig;
 
+use photos::dataset;
 use serde_json::{Value, json};
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
@@ -12,25 +14,6 @@ use trainer::checkpoint::Checkpoint;
 const N_STEPS: &str = "260";
 const HALF: &str = "130";
 const N_KILLS: u32 = 6;
-const SIZE_PX: [u32; 2] = [64, 48];
-
-/// Ten photos of a patterned wall, taken from places in a row.
-fn dataset(folder: &Path) {
-    let mut frames = Vec::new();
-    for ix in 0..10 {
-        let name = format!("{ix:03}.png");
-        let shade = |x: u32, y: u32| u8::try_from((x / 8 + y / 8 + ix) % 2 * 150 + x).unwrap();
-        let photo = image::RgbImage::from_fn(SIZE_PX[0], SIZE_PX[1], |x, y| {
-            image::Rgb([shade(x, y), shade(y, x), u8::try_from(5 * y).unwrap()])
-        });
-        photo.save(folder.join(&name)).unwrap();
-        let x = 0.05 * f64::from(ix);
-        let pose = [[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 1.0, 2.0], [0.0, 0.0, 0.0, 1.0]];
-        frames.push(json!({ "file_path": name, "transform_matrix": pose }));
-    }
-    let lens = json!({ "w": 64, "h": 48, "fl_x": 60.0, "fl_y": 60.0, "cx": 32.0, "cy": 24.0, "frames": frames });
-    std::fs::write(folder.join("transforms.json"), lens.to_string()).unwrap();
-}
 
 fn train(folder: &Path, args: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
@@ -59,7 +42,6 @@ fn refused(output: &Output, code: i32) -> String {
 fn two_halves_give_the_bits_of_the_whole() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    std::fs::create_dir(folder.join("data")).unwrap();
     dataset(&folder.join("data"));
     let common = ["--max-splats", "600", "--seed", "3"];
     let whole = done(folder, &[&["--steps", N_STEPS, "--out", "whole"], &common[..]].concat());
@@ -122,7 +104,6 @@ fn tells_what_it_cannot_go_on_from(folder: &Path) {
 fn what_the_clock_ended_is_repeated_by_its_log() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    std::fs::create_dir(folder.join("data")).unwrap();
     dataset(&folder.join("data"));
     let settings =
         ["--max-splats", "600", "--seed", "3", "--scale", "0.5", "--holdout", "5", "--refine", "image-poses"];
@@ -163,7 +144,6 @@ fn what_the_clock_ended_is_repeated_by_its_log() {
 fn a_run_that_is_killed_again_and_again_ends_with_the_same_bits() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    std::fs::create_dir(folder.join("data")).unwrap();
     dataset(&folder.join("data"));
     let first = ["--max-splats", "600", "--out", "killed", "--steps", N_STEPS, "--checkpoint-secs", "0.001"];
     let whole = done(folder, &["--steps", N_STEPS, "--max-splats", "600", "--out", "whole"]);

@@ -124,12 +124,15 @@ impl NerfModel {
     /// The field as it is; what was sent must be done.
     pub(super) fn saved(&self) -> Result<Saved, Error> {
         let reads = self.field.as_ref().map_or(Vec::new(), |(_, learner)| begin_read(&self.gpu, learner.learned()));
-        Ok(Saved { arrays: finish(&self.gpu, reads)?, step: self.step, learned: self.learned })
+        let (step, n_hinted, learned) = (self.step, self.n_hinted, self.learned);
+        Ok(Saved { arrays: finish(&self.gpu, reads)?, step, n_hinted, learned })
     }
 
     /// Makes the field what it was; what was sent must be done.
     pub(super) fn put_back(&mut self, saved: &Saved) -> Result<(), Error> {
         (self.step, self.learned) = (saved.step, saved.learned);
+        self.n_hinted = saved.n_hinted.min(self.images.len());
+        self.is_extent_due |= self.n_hinted < self.images.len(); // Those are hinted at again.
         self.fixes = None;
         let Some((_, learner)) = &mut self.field else { return Ok(()) };
         match saved.n_terms() {
@@ -150,6 +153,8 @@ impl NerfModel {
         let (gpu, mut state) = (self.gpu.clone(), self.state()?);
         if let Some(before) = self.trials.before() {
             (state.step, state.learned, state.n_terms) = (before.step, before.learned, before.n_terms());
+            state.n_hinted = before.n_hinted.min(self.images.len());
+            state.is_extent_due |= state.n_hinted < self.images.len();
             let (state, arrays) = (written(&state)?, before.arrays.clone());
             return Ok(PendingCheckpoint::new(move || Ok(Checkpoint::new(METHOD, state, arrays))));
         }

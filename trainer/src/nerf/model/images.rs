@@ -36,6 +36,8 @@ const JUDGING_SEED: u64 = 0x6a75_6467;
 pub(super) struct Saved {
     pub(super) arrays: Vec<Array>,
     pub(super) step: u64,
+    /// Images that the field had hints of.
+    pub(super) n_hinted: usize,
     pub(super) learned: TermSet,
 }
 

@@ -1,0 +1,208 @@
+#!/usr/bin/env python3
+"""Interrupts commands at random moments and checks that nothing captured is lost.
+
+    scripts/interrupt.py target/release/fieldrig FOLDER CASE train|run|record [-n 20] [--seed 1] [--method splat] [--no-hangup]
+
+CASE is one of
+    close   the terminal closes at a random moment; with --no-hangup no SIGHUP comes with it, as after a broken connection
+    head    the reader of stdout goes away after one line
+    full    stdout and stderr are /dev/full
+    disk    the outputs lie on a tmpfs of 6 MB (needs root)
+    kill    only for train: SIGKILL at a random moment after the first checkpoint; the run is then resumed without flags and must end with
+            the hash of an uninterrupted one
+
+A trial passes if its recording can be read and its model, or a checkpoint, can be loaded. FOLDER keeps the files of trials that fail.
+"""
+
+import argparse
+import json
+import os
+import pty
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+PATIENCE_SECS = 300
+# Limits with which a model trains within seconds without a GPU.
+SMALL = ["--max-splats", "2000"]
+# What each command prints once it has its first keyframe or image.
+FIRST_WORDS = {"train": b"step", "run": b"step", "record": b"color images"}
+
+
+def expect(condition, message):
+    if not condition:
+        raise AssertionError(message)
+
+
+class Trial:
+    def __init__(self, args, n):
+        self.args, self.random = args, random.Random(args.seed * 1000 + n)
+        self.exe, self.rig = Path(args.fieldrig).resolve(), Path(args.rig).resolve()
+        self.data = Path(args.folder).resolve() / "data.mcap"
+        self.folder = self.data.parent / f"{args.case}-{args.command}-{n}"
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self.out = self.folder / "out"
+        self.rescued = self.folder / "tmp"
+        for made in [self.out, self.rescued]:
+            made.mkdir(parents=True)
+
+    def fieldrig(self, *args):
+        """Runs a command that has to succeed; its stdout comes back."""
+        done = subprocess.run([self.exe, *map(str, args)], capture_output=True, text=True, timeout=PATIENCE_SECS)
+        expect(done.returncode == 0, f"{' '.join(map(str, args))}: {done.stderr[-1500:]}")
+        return done.stdout
+
+    def command(self, seconds):
+        model, recording = ["--out", self.out / "model"], self.out / "run.mcap"
+        live = ["--listen", "127.0.0.1:0", "--when-done", "exit"]
+        words = {
+            "train": ["train", self.data, "--seconds", seconds, *SMALL, *model],
+            "run": ["run", self.rig, "--sim", "--seconds", seconds, *SMALL, *live, "--record", recording, *model],
+            "record": ["record", self.rig, "--sim", "--seconds", seconds, "--out", recording],
+        }[self.args.command]
+        return [self.exe, *map(str, words)]
+
+    def start(self, command, **streams):
+        environment = {**os.environ, "TMPDIR": str(self.rescued)}
+        return subprocess.Popen(command, stdin=subprocess.DEVNULL, env=environment, **streams)
+
+    def check(self):
+        """Reads what the command left."""
+        read = self.folder / "read"
+        if self.args.command != "train":
+            self.fieldrig("export", self.out / "run.mcap", "--to", "nerfstudio", "--out", read)
+        if self.args.command == "record":
+            return "the recording reads"
+        models = [self.out / "model", *self.rescued.iterdir()]
+        saved = [model for model in models if (model / "splats.ply").is_file()]
+        if saved:
+            self.fieldrig("export", saved[0], "--to", "spz", "--out", self.folder / "read.spz")
+            return f"the model in {saved[0].name} loads"
+        expect((self.out / "model/training.ckpt").is_file(), "neither a model nor a checkpoint")
+        self.fieldrig("train", self.data, "--resume", self.out / "model", "--out", self.folder / "resumed")
+        return "the checkpoint resumes"
+
+    def close(self):
+        """Closes the terminal at a random moment after the first keyframe."""
+        ours, theirs = pty.openpty()
+        command = self.command(60)
+        if not self.args.no_hangup:
+            command = ["setsid", "--ctty", *command]
+        process = subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=self.args.no_hangup)
+        os.close(theirs)
+        text, close_at = b"", None
+        while close_at is None or time.monotonic() < close_at:
+            text += os.read(ours, 65536)
+            if close_at is None and FIRST_WORDS[self.args.command] in text:
+                wait_secs = self.random.uniform(0.0, self.args.within)
+                close_at = time.monotonic() + wait_secs
+        os.close(ours)
+        closed = time.monotonic()
+        if self.args.no_hangup:  # It goes on to its end, and nobody waits a minute for that.
+            time.sleep(3.0)
+            expect(process.poll() is None, "it ended with its terminal")
+            process.send_signal(signal.SIGINT)
+        code = process.wait(PATIENCE_SECS)
+        expect(code == 3, f"exit code {code}: {text[-1500:]}")
+        return f"closed {wait_secs:.1f} s after the first keyframe, ended after {time.monotonic() - closed:.1f} s"
+
+    def head(self):
+        command = [*self.command(self.random.uniform(2, 8)), "--json"]
+        process = self.start(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        line = process.stdout.readline()
+        process.stdout.close()
+        code = process.wait(PATIENCE_SECS)
+        expect(code in (0, 3), f"exit code {code} after {line}")
+        return f"exit code {code}"
+
+    def full(self):
+        with open("/dev/full", "w") as full:
+            code = self.start(self.command(self.random.uniform(2, 8)), stdout=full, stderr=full).wait(PATIENCE_SECS)
+        expect(code == 3, f"exit code {code}")
+        return "exit code 3"
+
+    def disk(self):
+        subprocess.run(["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", self.out], check=True)
+        # From empty to almost full: each file in turn is the one that finds no room.
+        (self.out / "filler").write_bytes(bytes(self.random.randrange(6 << 20)))
+        command = self.command(10)
+        process = self.start(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        text = process.communicate(timeout=PATIENCE_SECS)[0].decode()
+        (self.folder / "output.txt").write_text(text)
+        expect("panicked" not in text, text[-1500:])
+        return f"exit code {process.returncode}"
+
+    def kill(self):
+        steps = ["--steps", str(self.args.steps), "--method", self.args.method, "--checkpoint-secs", "1"]
+        more = SMALL if self.args.method == "splat" else []
+        command = [self.exe, "train", self.data, *steps, *more, "--json", "--out"]
+        whole, secs = self.data.parent / f"whole-{self.args.method}.json", self.data.parent / f"whole-{self.args.method}"
+        if not whole.exists():
+            begun = time.monotonic()
+            done = json.loads(self.fieldrig(*command[1:], secs).splitlines()[-1])
+            whole.write_text(json.dumps({"sha256": done["checkpoint_sha256"], "secs": time.monotonic() - begun}))
+        expected = json.loads(whole.read_text())
+        run = self.out / "model"
+        process = self.start([*command, run], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while not (run / "training.ckpt").exists():
+            expect(process.poll() is None, "it ended before its first checkpoint")
+            time.sleep(0.01)
+        wait_secs = self.random.uniform(0.0, max(expected["secs"] - 3.0, 1.0))
+        time.sleep(wait_secs)
+        process.send_signal(signal.SIGKILL)
+        was_killed = process.wait() == -signal.SIGKILL
+        done = json.loads(self.fieldrig("train", self.data, "--resume", run, "--json").splitlines()[-1])
+        expect(done.get("checkpoint_sha256") == expected["sha256"], f"another hash: {done}")
+        return f"killed {wait_secs:.1f} s after the first checkpoint" if was_killed else "it had ended"
+
+    def run(self):
+        try:
+            told = getattr(self, self.args.case)()
+            if self.args.case != "kill":
+                told += "; " + self.check()
+        finally:
+            if self.args.case == "disk":
+                subprocess.run(["umount", "--lazy", self.out], check=False)
+        return told
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("fieldrig", help="the program")
+    parser.add_argument("folder", help="holds the data that is trained on, made where it is missing, and the trials")
+    parser.add_argument("case", choices=["close", "head", "full", "disk", "kill"])
+    parser.add_argument("command", choices=["train", "run", "record"])
+    parser.add_argument("-n", type=int, default=20, help="trials (default 20)")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--rig", default="rigs/static-arm.toml")
+    parser.add_argument("--within", type=float, default=10.0, help="seconds after the first keyframe within which a terminal closes")
+    parser.add_argument("--no-hangup", action="store_true", help="no SIGHUP comes with the end of the terminal")
+    parser.add_argument("--method", default="splat", help="for kill")
+    parser.add_argument("--steps", type=int, default=300, help="for kill")
+    args = parser.parse_args()
+    if args.case == "kill" and args.command != "train":
+        parser.error("kill is for train")
+    data = Path(args.folder).resolve() / "data.mcap"
+    data.parent.mkdir(parents=True, exist_ok=True)
+    if not data.exists():
+        record = [args.fieldrig, "record", args.rig, "--sim", "--seconds", "6", "--out", data]
+        subprocess.run(record, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    n_passed = 0
+    for n in range(args.n):
+        trial = Trial(args, n)
+        try:
+            print(f"{args.case} {args.command} {n}: {trial.run()}", flush=True)
+            shutil.rmtree(trial.folder)
+            n_passed += 1
+        except (AssertionError, OSError, subprocess.SubprocessError) as error:
+            print(f"{args.case} {args.command} {n}: FAILED: {error}", flush=True)
+    print(f"{n_passed} of {args.n} passed", flush=True)
+    sys.exit(n_passed != args.n)
+
+
+if __name__ == "__main__":
+    main()
