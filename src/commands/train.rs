@@ -129,6 +129,10 @@ fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
     let whose = args.resume.as_deref().map(|folder| format!("the checkpoint in {}", folder.display()));
     if let (Some(checkpoint), Some(whose)) = (&checkpoint, &whose) {
         if args.is_finished(checkpoint) {
+            if let Some(model) = &args.depth_from {
+                let sha256 = DepthSource::find(model)?.sha256;
+                depth_from::check_same(whose, checkpoint.depth_from.as_deref(), Some(&sha256))?;
+            }
             return args.report_finished(checkpoint);
         }
         refuse_over(args.seconds, checkpoint, whose)?;
