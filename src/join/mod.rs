@@ -139,7 +139,7 @@ impl Join {
         let mut evicted = Vec::new();
         for keyframe in keyframes {
             if let Some(camera) = self.cameras.iter_mut().find(|camera| camera.config.name == keyframe.camera) {
-                camera.acceptance.accept(keyframe.stamp, &keyframe.world_from_camera);
+                camera.acceptance.accept_earlier(&keyframe.world_from_camera);
                 camera.n_accepted += 1;
             }
             evicted.extend(self.store.push(Arc::clone(keyframe)));
