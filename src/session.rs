@@ -243,6 +243,9 @@ pub(crate) fn finish(mut endings: Vec<Ending<impl Serialize>>) -> anyhow::Result
             Err(error) => failed = failed.and(Err(error)),
         }
     }
+    for (ending, ..) in &mut saved {
+        failed = failed.and(ending.session.checkpoints.as_mut().map_or(Ok(()), Checkpoints::wait));
+    }
     if saved.iter().any(|(ending, ..)| ending.session.stop.asked()) {
         log::info!("saved; scoring the test images, Ctrl-C again leaves that out");
     }
@@ -790,7 +793,6 @@ impl Session {
         if let Err(error) = &page {
             log::warn!("no {}: {error:#}", report::FILE);
         }
-        let last_checkpoint = written.and(self.checkpoints.as_mut().map_or(Ok(()), Checkpoints::wait));
         match self.tell {
             Tell::Json => {
                 if self.profiles {
@@ -798,28 +800,24 @@ impl Session {
                     print::report_json(&Profile { event: "profile", method: self.kind.name(), passes })?;
                 }
                 print::report_json(&done)?;
-                last_checkpoint?;
-                return Ok(self.finished(out, (seconds, done.scores), outcome.per_image.len()));
             }
-            Tell::Bar | Tell::Nothing => {
-                last_checkpoint?;
-                return Ok(self.finished(out, (seconds, done.scores), outcome.per_image.len()));
+            Tell::Lines => {
+                for (name, millis) in &report.passes {
+                    print::report(format_args!("{millis:9.3} ms  {name}"));
+                }
+                print::report(format_args!(
+                    "{seconds:.1} s, {}, {}, {:.1} MB: {}",
+                    print::counted(done.steps, "step"),
+                    print::counted(done.primitives, self.method.primitive()),
+                    done.bytes as f64 / 1e6,
+                    done.scores
+                ));
+                let with_page = if page.is_ok() { ", with pictures and scores in report.html" } else { "" };
+                print::report(format_args!("saved in {}{with_page}", out.display()));
             }
-            Tell::Lines => {}
+            Tell::Bar | Tell::Nothing => {}
         }
-        for (name, millis) in &report.passes {
-            print::report(format_args!("{millis:9.3} ms  {name}"));
-        }
-        print::report(format_args!(
-            "{seconds:.1} s, {}, {}, {:.1} MB: {}",
-            print::counted(done.steps, "step"),
-            print::counted(done.primitives, self.method.primitive()),
-            done.bytes as f64 / 1e6,
-            done.scores
-        ));
-        let with_page = if page.is_ok() { ", with pictures and scores in report.html" } else { "" };
-        print::report(format_args!("saved in {}{with_page}", out.display()));
-        last_checkpoint?;
+        written?;
         Ok(self.finished(out, (seconds, done.scores), outcome.per_image.len()))
     }
 
