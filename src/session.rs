@@ -514,13 +514,13 @@ impl Session {
         let Some(recovery) = &self.recovery else { anyhow::bail!("this run cannot continue on another device") };
         let written = self.checkpoints.as_mut().and_then(Checkpoints::newest).map(Path::to_owned);
         let checkpoint = match (written, &recovery.resumed) {
-            (Some(path), _) => Some(Checkpoint::read(&path)?),
-            (None, Some(folder)) => Some(checkpoints::read(folder)?),
+            (Some(path), _) => Some(Checkpoint::read(&path).map_err(anyhow::Error::from)),
+            (None, Some(folder)) => Some(checkpoints::read(folder)),
             (None, None) => None,
         };
         let held: Vec<Arc<Keyframe>> = recovery.known.iter().chain(&self.keyframes).cloned().collect();
         let all = [&held[..], &self.evicted[..]].concat();
-        let resumed = checkpoint.map(|checkpoint| method::resume(gpu.clone(), &checkpoint, &all)).transpose();
+        let resumed = checkpoint.map(|checkpoint| method::resume(gpu.clone(), &checkpoint?, &all)).transpose();
         let resumed = resumed.or_else(|error| {
             if recovery::is_of_gpu(&error) {
                 return Err(error);
@@ -540,8 +540,10 @@ impl Session {
             method.remove(&keyframe.camera, keyframe.stamp)?;
         }
         let from_step = method.n_taken()?;
-        // The log so far is that of a run that ended here; what follows is a log of its own.
-        self.decisions = None;
+        // The log so far is that of a run that ended here; what follows is a log of its own, perhaps in the same file.
+        if let Some(decisions) = self.decisions.take() {
+            decisions.break_off();
+        }
         let settings = recovery.settings.after(is_resumed.then_some(from_step));
         let mut decisions = DecisionLog::create(&recovery.folder, settings)?;
         held.iter().filter(|keyframe| !is_in(&rest, keyframe)).for_each(|keyframe| decisions.had(from_step, keyframe));
@@ -554,7 +556,8 @@ impl Session {
             if is_resumed { format!("the checkpoint of step {from_step}") } else { "the start".to_owned() }
         );
         (self.method, self.gpu, self.decisions) = (method, gpu.clone(), Some(decisions));
-        self.rested_secs = None;
+        // All images of a mark are scored on one state of the model, and that one is gone.
+        (self.rested_secs, self.open_mark) = (None, None);
         Ok(())
     }
 
