@@ -708,7 +708,9 @@ impl Session {
             log::warn!("the model is empty: nothing that was seen could be used");
         }
         // Saving ends a trial that is under way; the checkpoint is of the state before it, so that a resumed run ends it when it is due.
-        let is_finished = self.is_over() || self.is_idle();
+        // A live run is over at its limit only: to a model that waits for keyframes more may come.
+        let is_live = self.checkpoints.as_ref().is_some_and(Checkpoints::keeps_keyframes);
+        let is_finished = self.is_over() || (self.is_idle() && !is_live);
         let (method, keyframes) = (self.method.as_mut(), &self.keyframes[..]);
         let snapshot = Snapshot { method, keyframes, seconds, is_finished };
         let checkpoint = match self.checkpoints.as_mut().map(|checkpoints| checkpoints.take(snapshot)).transpose() {
