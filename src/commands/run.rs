@@ -8,7 +8,7 @@ use crate::evaluate::Evaluator;
 use crate::exit::{self, BadArgument, Exit, LackOfEvidence};
 use crate::feed::{Feed, Input};
 use crate::join::{Counts, Join, Refusal, Use};
-use crate::kept_keyframes::KeptKeyframes;
+use crate::kept_keyframes::{self, KeptKeyframes};
 use crate::live::{Live, LiveOptions, Pace};
 use crate::method::{self, Kind, Recipe, Resumed};
 use crate::next_commands::{DataSource, quoted};
@@ -239,6 +239,9 @@ impl Running {
 pub(super) fn start(args: &Args, earlier: Option<&Earlier>, made: &mut MadeFolders) -> anyhow::Result<Running> {
     if let Some(out) = &args.out {
         run_folder::refuse_model(out)?;
+        if args.resume.as_ref() != Some(out) {
+            kept_keyframes::refuse_unfinished(out)?;
+        }
     }
     let stop = Stop::on_ctrl_c()?;
     let mut overrides = args.overrides();
