@@ -376,7 +376,18 @@ fn save(
     let live_error_m = worst_position_error_m(live.keyframes());
     let left = live.what_is_left();
     let (sessions, leftover) = live.finish();
-    let leftover = leftover?;
+    let leftover = match leftover {
+        Ok(leftover) => leftover,
+        Err(error) => {
+            // A bug of the input does not cost the models.
+            let particulars = || serde_json::json!({ "losses": [error.to_string()] });
+            let ending = |(session, out): (Session, PathBuf)| Ending { particulars: particulars(), session, out };
+            if n_train > 0 {
+                session::finish(sessions.into_iter().zip(folders).map(ending).collect())?;
+            }
+            return Err(error);
+        }
+    };
     // A disk that has no room for these may have some for the models.
     let list = |(session, folder): (&Session, &PathBuf)| {
         run_folder::write_keyframe_list(&folder.join("keyframes.txt"), session.keyframes())
