@@ -553,7 +553,8 @@ impl Args {
 
     /// What `eval` needs to score the model in `folder` on the images of this run.
     fn data_source(&self, folder: &Path) -> DataSource {
-        let path = self.record.as_ref().or(self.from.as_ref()).cloned();
+        // A recording that began with --resume lacks the images before it.
+        let path = self.record.as_ref().or(self.from.as_ref()).filter(|_| self.resume.is_none()).cloned();
         let rig = folder.join(drivers::recording::RIG_FILE).display().to_string();
         DataSource { path, flags: vec!["--rig".to_owned(), rig], ..DataSource::default() }
     }
