@@ -148,6 +148,11 @@ impl Join {
         (self, evicted)
     }
 
+    /// The stamp of a sample on the clock of keyframes.
+    pub(crate) fn shifted(&self, stamp: Stamp) -> Stamp {
+        Stamp(stamp.0.saturating_add(self.shift_nanos.unwrap_or_default()))
+    }
+
     /// Takes in one sample; tells what followed from it.
     pub(crate) fn push(&mut self, sample: Sample) -> Vec<JoinEvent> {
         let mut events = Vec::new();
