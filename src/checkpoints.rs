@@ -117,6 +117,11 @@ impl Checkpoints {
         Self { kept_keyframes: Some(KeptKeyframes::of_run(run)), ..self }
     }
 
+    /// Whether it keeps them.
+    pub(crate) fn keeps_keyframes(&self) -> bool {
+        self.kept_keyframes.is_some()
+    }
+
     /// Begins one when it is due and the one before is written, and says so. A disk that refuses one does not stop training.
     pub(crate) fn when_due(&mut self, now: Snapshot<'_>) -> Result<bool, trainer::Error> {
         if self.writing.as_ref().is_some_and(|writing| !writing.thread.is_finished()) {

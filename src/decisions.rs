@@ -281,6 +281,12 @@ impl DecisionLog {
         written.context("the log of decisions is not whole")
     }
 
+    /// Ends the log as that of a run that is killed; all that was decided so far is written when this returns.
+    pub(crate) fn break_off(self) {
+        drop(self.sender);
+        let _ = self.thread.join(); // A log that is not whole is one that was cut off earlier.
+    }
+
     /// Writes down what happened between two decisions where no update tells it.
     fn come_to(&mut self, step: u64) {
         let between = match std::mem::replace(&mut self.since, Since::Nothing) {

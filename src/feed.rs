@@ -163,6 +163,7 @@ impl Pump {
             }
             let newest = sample.stamp();
             let events = self.input.join.push(sample);
+            let newest = self.input.join.shifted(newest);
             if self.forward(events).and_then(|()| self.pass_time(newest)).is_err() {
                 break;
             }

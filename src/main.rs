@@ -52,7 +52,6 @@ mod turns;
 mod viewer;
 
 use clap::Parser;
-use std::io::Write;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
@@ -60,15 +59,16 @@ fn main() -> ExitCode {
     let cli = cli::Cli::parse();
     print::start_log(cli.verbose);
     let ended = commands::run(cli.command);
+    if let Err(error) = &ended
+        && !exit::is_broken_pipe(error)
+    {
+        print::error(error);
+    }
     print::flush();
     match ended {
         Ok(exit) => exit.or_lost_output().into(),
         Err(error) if exit::is_broken_pipe(&error) => exit::Exit::Done.into(),
-        Err(error) => {
-            // Where stderr is gone too, the exit code remains.
-            let _ = writeln!(std::io::stderr(), "error: {error:#}");
-            exit::of(&error).into()
-        }
+        Err(error) => exit::of(&error).into(),
     }
 }
 

@@ -2,8 +2,8 @@
 //!
 //! A [`Partial`] removes what it names unless it is kept, after an error and after a signal alike.
 
+use crate::stop;
 use anyhow::Context;
-use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -57,11 +57,11 @@ impl Drop for Partial {
     }
 }
 
-/// Makes SIGINT, SIGTERM and SIGHUP remove what is under way before they end the process.
+/// Makes the signals that ask for an end remove what is under way before they end the process.
 ///
 /// For commands that have nothing to save when they are cancelled; others use [`crate::stop::Stop`].
 pub(crate) fn remove_on_signals() -> anyhow::Result<()> {
-    let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP]).context("cannot listen to signals")?;
+    let mut signals = Signals::new(stop::ending_signals()).context("cannot listen to signals")?;
     let remove_all = move || {
         if let Some(signal) = signals.forever().next() {
             // Held to the end, so that nothing begins meanwhile.

@@ -171,6 +171,12 @@ pub(crate) fn report(text: impl Display) {
     }
 }
 
+/// Prints the error that ends the program on stderr, as the log is: a terminal that takes no output does not keep the program from
+/// ending, and the exit code remains.
+pub(crate) fn error(error: &anyhow::Error) {
+    let _ = BARS.suspend(|| WRITER.try_send(Piece::Err(format!("error: {error:#}\n").into_bytes())));
+}
+
 /// Whether a line of [`report`] was lost.
 pub(crate) fn lost_output() -> bool {
     LOST_OUTPUT.load(Ordering::Relaxed)

@@ -1,6 +1,7 @@
 //! Where the results of a run go, and what its report says.
 
 use crate::config::Rig;
+use crate::data::is_recording;
 use crate::exit::{self, BadArgument, Exit};
 use crate::method::Kind;
 use crate::splat_file;
@@ -158,10 +159,15 @@ impl MadeFolders {
         Ok(made)
     }
 
-    /// Removes what was made and all in it, but not where a model or a checkpoint is: somebody will want that.
+    /// Removes what was made and all in it, but not where a model, a checkpoint or a recording is: somebody will want that.
     pub(crate) fn take_back(self) {
-        let is_wanted =
-            |folder: &PathBuf| MODEL_FILES.iter().chain([&CHECKPOINT]).any(|name| folder.join(name).exists());
+        let holds_recording = |folder: &PathBuf| {
+            let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+            entries.map(|entry| entry.path()).any(|path| is_recording(&path))
+        };
+        let is_wanted = |folder: &PathBuf| {
+            holds_recording(folder) || MODEL_FILES.iter().chain([&CHECKPOINT]).any(|name| folder.join(name).exists())
+        };
         if self.leaves.iter().any(is_wanted) {
             return;
         }
@@ -378,7 +384,8 @@ mod tests {
             assert_eq!((asked.exists(), asked.join("tsdf").exists()), (is_left, false), "{asked:?}");
         }
         assert!(!folder.path().join("a").exists());
-        for (ended, file) in [(refused(), CHECKPOINT), (Err(anyhow::anyhow!("the disk is full")), "keyframes.txt")] {
+        let failed = Err(anyhow::anyhow!("the disk is full"));
+        for (ended, file) in [(refused(), CHECKPOINT), (refused(), "scan.mcap"), (failed, "keyframes.txt")] {
             let mut made = MadeFolders::default();
             let out = folder.path().join(file);
             made.make(Some(&out)).expect("it is free");

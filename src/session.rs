@@ -243,6 +243,9 @@ pub(crate) fn finish(mut endings: Vec<Ending<impl Serialize>>) -> anyhow::Result
             Err(error) => failed = failed.and(Err(error)),
         }
     }
+    for (ending, ..) in &mut saved {
+        failed = failed.and(ending.session.checkpoints.as_mut().map_or(Ok(()), Checkpoints::wait));
+    }
     if saved.iter().any(|(ending, ..)| ending.session.stop.asked()) {
         log::info!("saved; scoring the test images, Ctrl-C again leaves that out");
     }
@@ -511,13 +514,13 @@ impl Session {
         let Some(recovery) = &self.recovery else { anyhow::bail!("this run cannot continue on another device") };
         let written = self.checkpoints.as_mut().and_then(Checkpoints::newest).map(Path::to_owned);
         let checkpoint = match (written, &recovery.resumed) {
-            (Some(path), _) => Some(Checkpoint::read(&path)?),
-            (None, Some(folder)) => Some(checkpoints::read(folder)?),
+            (Some(path), _) => Some(Checkpoint::read(&path).map_err(anyhow::Error::from)),
+            (None, Some(folder)) => Some(checkpoints::read(folder)),
             (None, None) => None,
         };
         let held: Vec<Arc<Keyframe>> = recovery.known.iter().chain(&self.keyframes).cloned().collect();
         let all = [&held[..], &self.evicted[..]].concat();
-        let resumed = checkpoint.map(|checkpoint| method::resume(gpu.clone(), &checkpoint, &all)).transpose();
+        let resumed = checkpoint.map(|checkpoint| method::resume(gpu.clone(), &checkpoint?, &all)).transpose();
         let resumed = resumed.or_else(|error| {
             if recovery::is_of_gpu(&error) {
                 return Err(error);
@@ -537,8 +540,10 @@ impl Session {
             method.remove(&keyframe.camera, keyframe.stamp)?;
         }
         let from_step = method.n_taken()?;
-        // The log so far is that of a run that ended here; what follows is a log of its own.
-        self.decisions = None;
+        // The log so far is that of a run that ended here; what follows is a log of its own, perhaps in the same file.
+        if let Some(decisions) = self.decisions.take() {
+            decisions.break_off();
+        }
         let settings = recovery.settings.after(is_resumed.then_some(from_step));
         let mut decisions = DecisionLog::create(&recovery.folder, settings)?;
         held.iter().filter(|keyframe| !is_in(&rest, keyframe)).for_each(|keyframe| decisions.had(from_step, keyframe));
@@ -551,7 +556,8 @@ impl Session {
             if is_resumed { format!("the checkpoint of step {from_step}") } else { "the start".to_owned() }
         );
         (self.method, self.gpu, self.decisions) = (method, gpu.clone(), Some(decisions));
-        self.rested_secs = None;
+        // All images of a mark are scored on one state of the model, and that one is gone.
+        (self.rested_secs, self.open_mark) = (None, None);
         Ok(())
     }
 
@@ -702,7 +708,9 @@ impl Session {
             log::warn!("the model is empty: nothing that was seen could be used");
         }
         // Saving ends a trial that is under way; the checkpoint is of the state before it, so that a resumed run ends it when it is due.
-        let is_finished = self.is_over() || self.is_idle();
+        // A live run is over at its limit only: to a model that waits for keyframes more may come.
+        let is_live = self.checkpoints.as_ref().is_some_and(Checkpoints::keeps_keyframes);
+        let is_finished = self.is_over() || (self.is_idle() && !is_live);
         let (method, keyframes) = (self.method.as_mut(), &self.keyframes[..]);
         let snapshot = Snapshot { method, keyframes, seconds, is_finished };
         let checkpoint = match self.checkpoints.as_mut().map(|checkpoints| checkpoints.take(snapshot)).transpose() {
@@ -790,7 +798,6 @@ impl Session {
         if let Err(error) = &page {
             log::warn!("no {}: {error:#}", report::FILE);
         }
-        let last_checkpoint = written.and(self.checkpoints.as_mut().map_or(Ok(()), Checkpoints::wait));
         match self.tell {
             Tell::Json => {
                 if self.profiles {
@@ -798,28 +805,24 @@ impl Session {
                     print::report_json(&Profile { event: "profile", method: self.kind.name(), passes })?;
                 }
                 print::report_json(&done)?;
-                last_checkpoint?;
-                return Ok(self.finished(out, (seconds, done.scores), outcome.per_image.len()));
             }
-            Tell::Bar | Tell::Nothing => {
-                last_checkpoint?;
-                return Ok(self.finished(out, (seconds, done.scores), outcome.per_image.len()));
+            Tell::Lines => {
+                for (name, millis) in &report.passes {
+                    print::report(format_args!("{millis:9.3} ms  {name}"));
+                }
+                print::report(format_args!(
+                    "{seconds:.1} s, {}, {}, {:.1} MB: {}",
+                    print::counted(done.steps, "step"),
+                    print::counted(done.primitives, self.method.primitive()),
+                    done.bytes as f64 / 1e6,
+                    done.scores
+                ));
+                let with_page = if page.is_ok() { ", with pictures and scores in report.html" } else { "" };
+                print::report(format_args!("saved in {}{with_page}", out.display()));
             }
-            Tell::Lines => {}
+            Tell::Bar | Tell::Nothing => {}
         }
-        for (name, millis) in &report.passes {
-            print::report(format_args!("{millis:9.3} ms  {name}"));
-        }
-        print::report(format_args!(
-            "{seconds:.1} s, {}, {}, {:.1} MB: {}",
-            print::counted(done.steps, "step"),
-            print::counted(done.primitives, self.method.primitive()),
-            done.bytes as f64 / 1e6,
-            done.scores
-        ));
-        let with_page = if page.is_ok() { ", with pictures and scores in report.html" } else { "" };
-        print::report(format_args!("saved in {}{with_page}", out.display()));
-        last_checkpoint?;
+        written?;
         Ok(self.finished(out, (seconds, done.scores), outcome.per_image.len()))
     }
 

@@ -40,8 +40,7 @@ impl Stop {
             // Actions of a signal run in the order in which they were registered: the first Ctrl-C only sets the flags.
             flag::register_conditional_shutdown(SIGINT, INTERRUPTED, interrupted.clone())?;
             flag::register(SIGINT, interrupted)?;
-            let signals = [SIGINT, SIGTERM].into_iter().chain((!is_ignored(SIGHUP)).then_some(SIGHUP));
-            signals.into_iter().try_for_each(|signal| flag::register(signal, stop.signaled.clone()).map(drop))
+            ending_signals().try_for_each(|signal| flag::register(signal, stop.signaled.clone()).map(drop))
         };
         register().context("cannot listen to signals")?;
         Ok(stop)
@@ -65,6 +64,11 @@ impl Stop {
         }
         signaled
     }
+}
+
+/// The signals that ask for an end; without SIGHUP where it is ignored.
+pub(crate) fn ending_signals() -> impl Iterator<Item = i32> {
+    [SIGINT, SIGTERM].into_iter().chain((!is_ignored(SIGHUP)).then_some(SIGHUP))
 }
 
 /// Whether this process was started with the signal ignored, which Linux reports in `/proc`.

@@ -8,7 +8,7 @@ use crate::evaluate::Evaluator;
 use crate::exit::{self, BadArgument, Exit, LackOfEvidence};
 use crate::feed::{Feed, Input};
 use crate::join::{Counts, Join, Refusal, Use};
-use crate::kept_keyframes::KeptKeyframes;
+use crate::kept_keyframes::{self, KeptKeyframes};
 use crate::live::{Live, LiveOptions, Pace};
 use crate::method::{self, Kind, Recipe, Resumed};
 use crate::next_commands::{DataSource, quoted};
@@ -239,6 +239,9 @@ impl Running {
 pub(super) fn start(args: &Args, earlier: Option<&Earlier>, made: &mut MadeFolders) -> anyhow::Result<Running> {
     if let Some(out) = &args.out {
         run_folder::refuse_model(out)?;
+        if args.resume.as_ref() != Some(out) {
+            kept_keyframes::refuse_unfinished(out)?;
+        }
     }
     let stop = Stop::on_ctrl_c()?;
     let mut overrides = args.overrides();
@@ -373,7 +376,18 @@ fn save(
     let live_error_m = worst_position_error_m(live.keyframes());
     let left = live.what_is_left();
     let (sessions, leftover) = live.finish();
-    let leftover = leftover?;
+    let leftover = match leftover {
+        Ok(leftover) => leftover,
+        Err(error) => {
+            // A bug of the input does not cost the models.
+            let particulars = || serde_json::json!({ "losses": [error.to_string()] });
+            let ending = |(session, out): (Session, PathBuf)| Ending { particulars: particulars(), session, out };
+            if n_train > 0 {
+                session::finish(sessions.into_iter().zip(folders).map(ending).collect())?;
+            }
+            return Err(error);
+        }
+    };
     // A disk that has no room for these may have some for the models.
     let list = |(session, folder): (&Session, &PathBuf)| {
         run_folder::write_keyframe_list(&folder.join("keyframes.txt"), session.keyframes())
@@ -539,7 +553,8 @@ impl Args {
 
     /// What `eval` needs to score the model in `folder` on the images of this run.
     fn data_source(&self, folder: &Path) -> DataSource {
-        let path = self.record.as_ref().or(self.from.as_ref()).cloned();
+        // A recording that began with --resume lacks the images before it.
+        let path = self.record.as_ref().or(self.from.as_ref()).filter(|_| self.resume.is_none()).cloned();
         let rig = folder.join(drivers::recording::RIG_FILE).display().to_string();
         DataSource { path, flags: vec!["--rig".to_owned(), rig], ..DataSource::default() }
     }

@@ -84,6 +84,12 @@ impl Acceptance {
         if relative >= self.config.min_sharpness_frac { Ok(()) } else { Err(Refusal::NotSharp) }
     }
 
+    /// Remembers a keyframe of the run that is resumed. Its stamp may be of another clock: the wait of a camera that stands still
+    /// begins anew.
+    pub(super) fn accept_earlier(&mut self, pose: &Transform) {
+        self.accepted.push(*pose);
+    }
+
     /// Remembers a keyframe.
     pub(super) fn accept(&mut self, stamp: Stamp, pose: &Transform) {
         self.accepted.push(*pose);
@@ -97,6 +103,21 @@ mod tests {
     use crate::config::{Override, Rig};
     use kinematics::Twist;
     use std::path::Path;
+
+    #[test]
+    fn a_still_camera_of_a_resumed_run_does_not_wait_for_the_clock_of_the_earlier_one() {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
+        let rig = Rig::load(&path, &[]).expect("a rig");
+        let fixed = || {
+            let spacing = Spacing { translation_m: 1.0, rotation_rad: 1.0 };
+            Acceptance::new(&rig.join, &rig.cameras[0], true, spacing)
+        };
+        let (mut running, mut resumed, pose) = (fixed(), fixed(), Transform::identity());
+        running.accept(Stamp(3_600_000_000_000), &pose);
+        assert_eq!(running.judge_motion(Stamp(0), &pose), Err(Refusal::NotMoved));
+        resumed.accept_earlier(&pose);
+        assert_eq!(resumed.judge_motion(Stamp(0), &pose), Ok(()));
+    }
 
     #[test]
     fn a_velocity_that_is_not_known_counts_only_where_the_shutter_rolls() {

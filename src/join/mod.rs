@@ -139,13 +139,18 @@ impl Join {
         let mut evicted = Vec::new();
         for keyframe in keyframes {
             if let Some(camera) = self.cameras.iter_mut().find(|camera| camera.config.name == keyframe.camera) {
-                camera.acceptance.accept(keyframe.stamp, &keyframe.world_from_camera);
+                camera.acceptance.accept_earlier(&keyframe.world_from_camera);
                 camera.n_accepted += 1;
             }
             evicted.extend(self.store.push(Arc::clone(keyframe)));
         }
         self.newest_earlier = keyframes.iter().map(|keyframe| keyframe.stamp).max();
         (self, evicted)
+    }
+
+    /// The stamp of a sample on the clock of keyframes.
+    pub(crate) fn shifted(&self, stamp: Stamp) -> Stamp {
+        Stamp(stamp.0.saturating_add(self.shift_nanos.unwrap_or_default()))
     }
 
     /// Takes in one sample; tells what followed from it.

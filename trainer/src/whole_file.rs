@@ -2,6 +2,7 @@
 
 use crate::Error;
 use std::fs::File;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 /// The name that a file has while it is written: `.part` follows its own.
@@ -20,9 +21,11 @@ pub(crate) fn write(path: &Path, contents: impl FnOnce(&mut File) -> std::io::Re
         file.sync_all()?;
         std::fs::rename(&partial, path)?;
         // The new name is on the disk only when its folder is.
-        match path.parent() {
-            Some(folder) if !folder.as_os_str().is_empty() => File::open(folder)?.sync_all(),
-            _ => File::open(".")?.sync_all(),
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        match File::open(folder)?.sync_all() {
+            // Some file systems, such as those of networks, cannot sync folders.
+            Err(error) if matches!(error.kind(), ErrorKind::InvalidInput | ErrorKind::Unsupported) => Ok(()),
+            synced => synced,
         }
     });
     if written.is_err() {

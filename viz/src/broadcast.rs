@@ -121,7 +121,12 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, bulletin: watch::Sen
                         bulletin.live_images.insert(Arc::clone(&camera), Item { number, message: message.clone() });
                     });
                 }
-                Err(error) => log::error!("encoding news failed: {error}"),
+                Err(error) => {
+                    log::error!("encoding news failed: {error}");
+                    // It is not known of what: everything may be encoded again when it changes.
+                    is_encoding_keyframes = false;
+                    begun.values_mut().for_each(|begun| begun.is_running = false);
+                }
             },
         }
         if hub.n_clients() == 0 {
