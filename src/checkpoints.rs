@@ -64,6 +64,8 @@ pub(crate) struct Checkpoints {
     path: PathBuf,
     run_flags: RunFlags,
     every: Duration,
+    /// Time after the last one at which the next is due.
+    due_after: Duration,
     last: Instant,
     /// Where keyframes are kept that no data on disk holds.
     kept_keyframes: Option<KeptKeyframes>,
@@ -99,6 +101,7 @@ impl Checkpoints {
             path,
             run_flags: RunFlags::default(),
             every,
+            due_after: every,
             last: Instant::now(),
             kept_keyframes: None,
             last_keyframes: Instant::now(),
@@ -112,9 +115,11 @@ impl Checkpoints {
         Self { run_flags, ..self }
     }
 
-    /// Keeps the keyframes too: for a live run, whose images are nowhere else.
+    /// Keeps the keyframes too: for a live run, whose images are nowhere else. The first checkpoint is written with the first keyframes,
+    /// because a run is resumed only from both.
     pub(crate) fn with_keyframes(self, run: &Path) -> Self {
-        Self { kept_keyframes: Some(KeptKeyframes::of_run(run)), ..self }
+        let due_after = self.every.min(KEYFRAME_PERIOD);
+        Self { kept_keyframes: Some(KeptKeyframes::of_run(run)), due_after, ..self }
     }
 
     /// Whether it keeps them.
@@ -127,7 +132,8 @@ impl Checkpoints {
         if self.writing.as_ref().is_some_and(|writing| !writing.thread.is_finished()) {
             return Ok(false);
         }
-        if self.last.elapsed() >= self.every {
+        let is_resumable = self.kept_keyframes.is_none() || !now.keyframes.is_empty();
+        if self.last.elapsed() >= self.due_after && is_resumable {
             self.begin(now)?;
             return Ok(true);
         }
@@ -169,18 +175,23 @@ impl Checkpoints {
         let thread = std::thread::spawn(move || job.write());
         self.writing = Some(Writing { thread, is_checkpoint: true });
         (self.last, self.last_keyframes) = (Instant::now(), Instant::now());
+        self.due_after = self.every;
     }
 
     fn wait_and_warn(&mut self) {
-        if let Err(error) = self.wait() {
-            log::warn!("no checkpoint, the one before stays: {error:#}");
+        let is_checkpoint = self.writing.as_ref().is_some_and(|writing| writing.is_checkpoint);
+        match self.wait() {
+            Ok(()) => {}
+            Err(error) if is_checkpoint => log::warn!("no checkpoint was written, the one before stays: {error:#}"),
+            // The next checkpoint needs them, and says what is wrong if that still holds.
+            Err(error) => log::debug!("keyframes were not written: {error:#}"),
         }
     }
 
     /// Where the newest one that this run has written lies. One under way that cannot be written any more is given up.
     pub(crate) fn newest(&mut self) -> Option<&Path> {
         if let Err(error) = self.wait() {
-            log::debug!("a checkpoint was under way: {error:#}");
+            log::warn!("the checkpoint under way was not written: {error:#}");
         }
         self.has_any.then_some(&self.path)
     }

@@ -15,6 +15,8 @@ use trainer::gpu::Gpu;
 
 /// How often a run opens the GPU again.
 const MAX_RECOVERIES: u32 = 3;
+/// A run that lasts for days may fail now and then: after this time without a failure the count begins again.
+const FORGOTTEN_AFTER: Duration = Duration::from_secs(600);
 /// A driver that resets needs a moment.
 const BEFORE_RETRY: Duration = Duration::from_secs(1);
 
@@ -88,6 +90,7 @@ pub(crate) fn with_what_is_left(error: anyhow::Error, left: &str) -> anyhow::Err
 #[derive(Debug, Default)]
 pub(crate) struct Recoveries {
     n: u32,
+    last: Option<Instant>,
 }
 
 impl Recoveries {
@@ -98,22 +101,28 @@ impl Recoveries {
             return Err(error);
         }
         let began = Instant::now();
+        if self.last.is_some_and(|last| last.elapsed() > FORGOTTEN_AFTER) {
+            self.n = 0;
+        }
         let mut error = error;
         while self.n < MAX_RECOVERIES {
+            if self.n > 0 {
+                std::thread::sleep(BEFORE_RETRY);
+            }
             self.n += 1;
             log::warn!("{error:#}: opening the GPU again, attempt {} of {MAX_RECOVERIES}", self.n);
             match restart_all(sessions) {
                 Ok(()) => {
                     // Several sessions share one clock.
                     sessions.iter().take(1).for_each(|session| session.exclude(began.elapsed()));
+                    self.last = Some(Instant::now());
                     return Ok(());
                 }
                 Err(again) => error = again,
             }
-            std::thread::sleep(BEFORE_RETRY);
         }
         let left = what_is_left(sessions);
-        Err(GpuGone(format!("{error:#}; the GPU was opened again {MAX_RECOVERIES} times in vain; {left}")).into())
+        Err(GpuGone(format!("{error:#}; gave up after opening the GPU again {MAX_RECOVERIES} times; {left}")).into())
     }
 }
 

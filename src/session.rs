@@ -402,7 +402,12 @@ impl Session {
     /// Holds a keyframe that the model has learned from before, in the run that is resumed.
     pub(crate) fn hold(&mut self, keyframe: &Arc<Keyframe>) {
         if keyframe.split == Split::Test {
-            self.tests.push_back(keyframe.clone());
+            if keyframe.rgba_srgb.chunks_exact(4).any(|pixel| pixel[3] > 0) {
+                self.tests.push_back(keyframe.clone());
+            } else {
+                let Keyframe { camera, stamp, .. } = &**keyframe;
+                log::warn!("the test image of {camera} at {} ns is not scored: its mask leaves no pixel", stamp.0);
+            }
         }
         self.keyframes.push(keyframe.clone());
     }
@@ -720,15 +725,15 @@ impl Session {
                 None
             }
         };
-        let saved = match run_folder::save_model(self.method.as_mut(), out) {
-            Ok(()) => Saved { folder: out.to_owned(), sha256: run_folder::checkpoint_sha256(out)?, failed: None },
-            Err(error) if exit::is_io(&error) => self.save_elsewhere(out, error)?,
-            Err(error) => return Err(error),
-        };
-        if let (Some(checkpoints), Some(checkpoint), None) = (&mut self.checkpoints, checkpoint, &saved.failed) {
+        let saved = run_folder::save_model(self.method.as_mut(), out).and_then(|()| run_folder::checkpoint_sha256(out));
+        if let (Some(checkpoints), Some(checkpoint)) = (&mut self.checkpoints, checkpoint) {
             checkpoints.write(checkpoint);
         }
-        Ok(saved)
+        match saved {
+            Ok(sha256) => Ok(Saved { folder: out.to_owned(), sha256, failed: None }),
+            Err(error) if exit::is_io(&error) => self.save_elsewhere(out, error),
+            Err(error) => Err(error),
+        }
     }
 
     /// Saves the model in a folder for temporary files, because that of its run refused it.

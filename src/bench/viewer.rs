@@ -149,7 +149,7 @@ impl Client {
         let n_header = u64::from(u32::from_le_bytes(length));
         ensure!(n_header <= n_bytes.saturating_sub(4).min(MAX_HEADER_BYTES), "a header of {n_header} bytes");
         let header: Value = serde_json::from_reader((&mut self.reader).take(n_header))?;
-        self.skip(n_bytes - 4 - n_header)?;
+        self.skip(n_bytes.saturating_sub(4 + n_header))?;
         if header["type"] == "picture" && header["last"] == true {
             self.n_pictures.fetch_add(1, Ordering::Relaxed);
             self.ask()?;

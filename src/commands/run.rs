@@ -168,7 +168,14 @@ fn drive(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
     let hub = live.hub();
     if let Err(error) = ended {
         stop.ask();
-        return Err(keep_input(live, &folders, error));
+        if recovery::is_of_gpu(&error) || error.is::<GpuGone>() {
+            return Err(keep_input(live, &folders, error));
+        }
+        log::error!("training broke off, saving what was learned: {error:#}");
+        if let Err(error) = save(live, args, &rig, folders, &damage) {
+            log::error!("{error:#}");
+        }
+        return Err(error);
     }
     if live.is_through() {
         log::info!("the devices ended, and all they told is in the model: no step is left to make");

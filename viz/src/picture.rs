@@ -70,7 +70,8 @@ fn pack_color(picture: &Picture, is_last: bool) -> Result<Vec<u8>, Unencodable> 
 
 /// The binary message of a live image, shrunk to what a page shows.
 pub(crate) fn pack_live_image(image: &LiveImage, clock: ServerClock) -> Result<Vec<u8>, Unsendable> {
-    let factor = image.size_px[0].div_ceil(MAX_LIVE_WIDTH_PX).max(1);
+    // A very flat image keeps one row.
+    let factor = image.size_px[0].div_ceil(MAX_LIVE_WIDTH_PX).min(image.size_px[1]).max(1);
     let decoded;
     let pixels = match &image.pixels {
         LivePixels::Jpeg(file) if factor == 1 => return Ok(live_message(image, image.size_px, 1, file, clock)),

@@ -188,7 +188,9 @@ fn a_bound_on_images_holds_and_changes_no_bit() {
     let max_bytes = 3 * LEVEL_0_BYTES;
     let (bounded_bytes, bounded_live, bounded) = run(max_bytes, train_one_by_one);
     assert!((1..=max_bytes).contains(&bounded_bytes), "{bounded_bytes} bytes of images");
-    assert_eq!(live_bytes - bounded_live, image_bytes - bounded_bytes, "images that left were freed");
+    // Longer submits have somewhat larger buffers of their own; no image is that small.
+    let unexplained = (live_bytes - bounded_live).abs_diff(image_bytes - bounded_bytes);
+    assert!(unexplained < LEVEL_0_BYTES / 4, "images that left were not freed: {unexplained} bytes");
     assert!(bounded == arrays, "the bound changed what is learned");
 
     // A submit of many steps needs more images at once than fit.
