@@ -60,7 +60,7 @@ impl Up {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     refuse_other_than_model(&args.model)?;
     let paths = run_folder::models_at(&args.model)?;
-    let stop = Stop::on_ctrl_c_logging("stopping; Ctrl-C again ends at once")?;
+    let stop = Stop::on_ctrl_c_logging("stopping; Ctrl-C again exits at once")?;
     let gpu = super::open_gpu()?;
     let hub = Hub::new();
     // Before the models are loaded, so that an address in use is reported at once.

@@ -1,4 +1,4 @@
-//! Marks that are scored image by image are those that are scored at once.
+//! Scoring image by image gives the same result as scoring at once.
 
 use super::*;
 use kinematics::{Stamp, Transform};
@@ -11,7 +11,7 @@ const SIZE_PX: [u32; 2] = [4, 2];
 const N_TESTS: u8 = 5;
 const MAX_AT_MARKS: usize = 3;
 
-/// A model whose pictures have one gray level, and which counts what it is asked for.
+/// A model that draws pictures of one gray level and counts them.
 #[derive(Default)]
 struct Gray {
     level: u8,
@@ -109,7 +109,7 @@ fn test_keyframe(ix: u8) -> Arc<Keyframe> {
     })
 }
 
-/// A session of a second that has a mark to report, and the counter of its pictures.
+/// A session of one second with an evaluation due, and the counter of its pictures.
 fn at_a_mark(stop: &Stop) -> (Session, std::rc::Rc<std::cell::Cell<u32>>) {
     let method = Gray::default();
     let n_drawn = method.n_drawn.clone();
