@@ -123,7 +123,7 @@ def ask(args, view):
 
 
 def run_client(args, address, begin, end, results):
-    """Asks for pictures back to back from `begin` to `end`, in seconds of the monotonic clock."""
+    """Requests pictures back to back from `begin` to `end`, in seconds of the monotonic clock."""
     try:
         results.put(measure(args, address, begin, end))
     except (OSError, ConnectionError, ValueError) as error:

@@ -547,7 +547,7 @@ impl Session {
             decisions.pushed(method.n_taken()?, keyframe);
         }
         log::info!(
-            "the GPU is back: training continues from {}",
+            "reopened the GPU: training continues from {}",
             if is_resumed { format!("the checkpoint of step {from_step}") } else { "the start".to_owned() }
         );
         (self.method, self.gpu, self.decisions) = (method, gpu.clone(), Some(decisions));

@@ -115,7 +115,7 @@ fn a_live_run_that_loses_its_gpu_continues_and_one_that_cannot_keeps_its_recordi
     };
     let lost = run("lost", &[("FIELDRIG_TEST_LOSE_GPU_AT_STEP", "120")]);
     let text = stderr(&lost);
-    assert!(text.contains("the GPU is back: training continues from"), "{text}");
+    assert!(text.contains("reopened the GPU: training continues from"), "{text}");
     assert_eq!(done(&lost)["steps"], 200);
 
     let gone = run("gone", &[("FIELDRIG_TEST_LOSE_GPU_AT_STEP", "120"), ("FIELDRIG_TEST_OPEN_GPU_ONCE", "1")]);

@@ -13,7 +13,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Size of the pictures it asks for, pixels.
+/// Size of the requested pictures, pixels.
 const SIZE_PX: [u32; 2] = [960, 720];
 /// Angle between two pictures on the circle around the scene, radians.
 const TURN_RAD: f64 = 0.05;

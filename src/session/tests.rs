@@ -147,7 +147,7 @@ fn a_mark_is_scored_image_by_image_and_gives_the_scores_of_one_scored_at_once() 
     assert_eq!((one.n_images, one.step), (3, 1));
     assert_eq!((other.n_images, other.step), (3, 1));
     assert!(one.scores == other.scores && one.scores.psnr.is_some());
-    assert!((other.seconds - 1.0).abs() < 0.9, "{} s: when the mark was reached", other.seconds);
+    assert!((other.seconds - 1.0).abs() < 0.9, "{} s: when the evaluation was due", other.seconds);
     assert!(stepwise.psnr() == at_once.psnr());
     stepwise.score_next().expect("nothing to do");
     assert_eq!((stepwise.told.len(), n_drawn.get()), (1, 3));

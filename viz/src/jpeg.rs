@@ -81,7 +81,7 @@ pub(crate) fn encode(pixels: &Pixels<'_>, quality: u8, chroma: Chroma) -> Result
 
 /// Encodes about `n_strips` strips in parallel.
 ///
-/// A strip is an image of its own with complete rows of blocks. Its scan starts and ends at a byte and predicts nothing
+/// A strip is a separate image with complete rows of blocks. Its scan starts and ends at a byte and predicts nothing
 /// from the strip before, exactly as at a restart marker. Joined by these markers, the scans therefore form the scan of
 /// the whole image with a restart interval of one strip (ITU-T T.81, sections B.2.4.4 and F.1.1.5).
 fn encode_in_strips(pixels: &Pixels<'_>, quality: u8, chroma: Chroma, n_strips: usize) -> Result<Vec<u8>, Unencodable> {
