@@ -1,7 +1,7 @@
 # The same commands by hand and in continuous integration; `make` alone lists them.
 #
-# Every target installs missing dependencies (system packages with apt when run as root, the pinned MuJoCo library,
-# the page's npm packages) and prints which; without root it prints the one line to run.
+# As root, every target installs missing dependencies (system packages with apt, the pinned MuJoCo library, the page's npm packages)
+# and lists them; without root, it prints the one command that installs them.
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test hil check fuzz deps web cargo packages test-packages check-packages mujoco realsense open-ends
@@ -63,8 +63,8 @@ cargo:
 packages:
 	@scripts/install-packages.sh build gpu sim web
 
-# Everything at once, so that there is one line to run without root. Tests whose packages cannot be installed are skipped with a message,
-# unless FIELDRIG_HIL=demand.
+# All groups in one call, so that without root there is one command to run. Tests whose packages cannot be installed are skipped with a
+# message, unless FIELDRIG_HIL=demand.
 OPTIONAL = $(if $(filter demand,$(FIELDRIG_HIL)),,--optional)
 test-packages: cargo
 	@scripts/install-packages.sh build gpu sim web nokhwa $(OPTIONAL) realsense hil
@@ -75,7 +75,7 @@ check-packages: cargo
 mujoco: packages
 	@scripts/fetch-mujoco.sh
 
-# Where it is not available, tests that need it are skipped with a message, unless FIELDRIG_HIL=demand.
+# If it is not available, tests that need it are skipped with a message, unless FIELDRIG_HIL=demand.
 realsense: check-packages
 	@scripts/install-packages.sh --check realsense && scripts/fetch-realsense.sh || { [ "$$FIELDRIG_HIL" != demand ] && \
 	echo "skipped: tests of RealSense cameras"; }

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Measure how long pictures of a running `fieldrig run` take, and what they cost training.
+"""Measures the latency of pictures from a running `fieldrig run`, and how much they slow down training.
 
-Clients ask for pictures back to back and measure from sending the request until the last
-stage has arrived in full. Prints one JSON object; needs nothing but Python 3.9.
+Clients request pictures back to back and measure the time from sending a request until the last
+stage has arrived completely. Prints one JSON object; needs only Python 3.9.
 
     fieldrig run rigs/static-arm.toml --sim &
     scripts/bench-latency.py --clients 0,1,8 --seconds 10
 
-`--clients 0` measures training alone. A client draws the first view of the scene.
+`--clients 0` measures training alone. Every client requests the first view of the scene.
 """
 
 import argparse
@@ -93,7 +93,7 @@ def status_of(address):
 
 
 def wait_for_training(address, timeout_s):
-    """Waits until at least one training step has been made."""
+    """Waits until the run has made at least one training step."""
     end = time.monotonic() + timeout_s
     while time.monotonic() < end:
         try:
@@ -103,11 +103,11 @@ def wait_for_training(address, timeout_s):
         except OSError:
             pass
         time.sleep(0.1)
-    sys.exit(f"bench-latency: nothing has been trained at {address[0]}:{address[1]} after {timeout_s:g} s")
+    sys.exit(f"bench-latency: no training step at {address[0]}:{address[1]} within {timeout_s:g} s")
 
 
 def ask(args, view):
-    """The fields of a request but for its id."""
+    """The fields of a request, without its id."""
     request = {
         "type": "render",
         "size_px": [args.size, args.size],
@@ -123,7 +123,7 @@ def ask(args, view):
 
 
 def run_client(args, address, begin, end, results):
-    """Asks for pictures back to back from `begin` to `end`, in seconds of the monotonic clock."""
+    """Requests pictures back to back from `begin` to `end`, in seconds of the monotonic clock."""
     try:
         results.put(measure(args, address, begin, end))
     except (OSError, ConnectionError, ValueError) as error:
@@ -173,7 +173,7 @@ def measure(args, address, begin, end):
 
 
 def quantile(values, share):
-    """By the nearest rank; none of nothing."""
+    """The nearest-rank quantile; None for an empty list."""
     ordered = sorted(values)
     return round(ordered[max(0, math.ceil(share * len(ordered)) - 1)], 2) if ordered else None
 
@@ -182,7 +182,7 @@ def steps_of(status, method):
     for model in [status, *status.get("others", [])]:
         if method is None or model.get("method") == method:
             return model["step"], model.get("step_millis"), model.get("primitives")
-    sys.exit(f"bench-latency: no model of the method {method!r} is trained there")
+    sys.exit(f"bench-latency: the run trains no model with the method {method!r}")
 
 
 def phase(args, address, n_clients):
@@ -196,7 +196,7 @@ def phase(args, address, n_clients):
     for client in clients:
         client.start()
     time.sleep(max(0.0, begin - time.monotonic()))
-    # The status is published four times a second: steps are counted from one change of it to the last.
+    # The status is published four times a second: steps are counted between its first and last change.
     samples = []
     while time.monotonic() < end:
         status = status_of(address)
@@ -244,14 +244,14 @@ def phase(args, address, n_clients):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--listen", default="127.0.0.1:7007", help="address of the running program [%(default)s]")
-    parser.add_argument("--clients", default="0,1,8", help="numbers of clients, one phase each [%(default)s]")
+    parser.add_argument("--clients", default="0,1,8", help="numbers of clients, separated by commas; one phase each [%(default)s]")
     parser.add_argument("--seconds", type=float, default=10.0, help="length of a phase [%(default)s]")
     parser.add_argument("--size", type=int, default=1024, help="width and height, pixels [%(default)s]")
     parser.add_argument("--outputs", choices=["color", "depth", "both"], default="both", help="[%(default)s]")
     parser.add_argument("--stages", help="scales separated by commas [those of the server]")
-    parser.add_argument("--method", help="which of several models [the first]")
+    parser.add_argument("--method", help="model to request if the run trains several [the first]")
     parser.add_argument("--wait", type=float, default=120.0, help="seconds to wait for the first step [%(default)s]")
-    parser.add_argument("--after", type=float, default=0.0, help="begin when so many seconds were trained [%(default)s]")
+    parser.add_argument("--after", type=float, default=0.0, help="start after this many seconds of training [%(default)s]")
     args = parser.parse_args()
     host, _, port = args.listen.rpartition(":")
     address = (host, int(port))

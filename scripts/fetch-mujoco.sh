@@ -1,6 +1,6 @@
 #!/bin/sh
 # Puts the pinned MuJoCo library into .deps/mujoco, out of its wheel on the Python package index.
-# Does nothing when the right library is there already. Needs python3 with pip (any version: the wheel is only unpacked);
+# Does nothing if the right library is already there. Needs python3 with pip (any version: the wheel is only unpacked);
 # installs no Python package.
 set -eu
 
@@ -48,7 +48,7 @@ trap 'rm -rf "$download"' EXIT
 trap 'exit 130' HUP INT TERM
 if ! python3 -m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: \
     --platform "$platform" --python-version 3.12 -d "$download" "mujoco==$version"; then
-    echo "fetch-mujoco: pip could not download mujoco==$version: its message is above; is the Python package index reachable?" >&2
+    echo "fetch-mujoco: pip could not download mujoco==$version (message above); check the connection to the Python package index" >&2
     exit 1
 fi
 python3 - "$download" "$library" <<'PYTHON'

@@ -41,7 +41,7 @@ trap 'rm -rf "$download"' EXIT
 trap 'exit 130' HUP INT TERM
 if ! python3 -m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: \
     --platform manylinux1_x86_64 --python-version 3.11 --implementation cp -d "$download" "$wheel"; then
-    echo "fetch-realsense: pip could not download $wheel: its message is above; is the Python package index reachable?" >&2
+    echo "fetch-realsense: pip could not download $wheel (message above); check the connection to the Python package index" >&2
     exit 1
 fi
 if [ "$(cat "$download"/*.whl | sha256sum | cut -d ' ' -f 1)" != "$sha256" ]; then

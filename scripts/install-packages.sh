@@ -1,26 +1,26 @@
 #!/bin/sh
-# Installs missing system packages with apt, and only those; prints which and why.
-# Without root it prints the one line to run and fails. Where nothing is missing it does nothing and prints nothing.
-# For Debian 12, Debian 13 and Ubuntu 24.04. scripts/test-install.sh runs it in fresh and half-equipped systems.
+# Installs missing system packages with apt, and nothing else; prints which packages and why.
+# Without root it prints the command to run and fails. If nothing is missing, it does nothing and prints nothing.
+# For Debian 12, Debian 13 and Ubuntu 24.04. scripts/test-install.sh runs it on systems with no packages or only some of them.
 #
 # Each check looks for what a build or a program uses (a header, a library for this processor, a command that runs), not
-# for the name of a package: half a package, another version or another source of the same thing is judged correctly.
+# for the name of a package: a partly installed package, another version or another source of the same thing is recognized.
 #
 # usage: install-packages.sh [--check] GROUP... [--optional GROUP...]      groups: build gpu sim web nokhwa realsense hil
 #   --check       print what is missing and fail; install nothing
-#   --optional    when packages of the groups after it cannot be installed, print so and succeed
+#   --optional    if packages of the groups after it cannot be installed, print a message and succeed
 set -eu
 
 PATH="$PATH:/usr/sbin:/sbin"
 export PATH
 
-# What is missing: package names, and one line of text each. `required` counts those that are not optional.
+# What is missing: package names, and one line of text for each. `required` counts the packages that are not optional.
 missing=""
 reasons=""
 required=0
 is_optional=false
 
-# need PACKAGE REASON: asks for a package.
+# need PACKAGE REASON: adds a missing package.
 need() {
     case "$missing " in
     *" $1 "*) return 0 ;;
@@ -31,7 +31,7 @@ need() {
     $is_optional || required=$((required + 1))
 }
 
-# need_package PACKAGE REASON: asks for a package unless dpkg lists it as installed for this processor.
+# need_package PACKAGE REASON: adds the package unless dpkg lists it as installed for this processor.
 need_package() {
     dpkg-query -W -f '${db:Status-Status} ${Architecture}\n' "$1" 2>/dev/null |
         grep -qxE "installed ($(dpkg --print-architecture)|all)" || need "$1" "$2"
@@ -42,19 +42,19 @@ need_command() {
     command -v "$1" >/dev/null 2>&1 || need "$2" "$3"
 }
 
-# need_file FILE PACKAGE REASON: asks for a package unless the file is readable.
+# need_file FILE PACKAGE REASON: adds the package unless the file is readable.
 need_file() {
     [ -r "$1" ] || need "$2" "$3"
 }
 
-# elf_machine FILE: word size and processor of a program or library, as in its header; fails for other files.
+# elf_machine FILE: prints word size and processor from the header of a program or library; fails for other files.
 elf_machine() {
     [ "$(head -c 4 "$1" 2>/dev/null | od -An -c | tr -d ' ')" = '177ELF' ] || return 1
     od -An -tx1 -j4 -N1 "$1"
     od -An -tx1 -j18 -N2 "$1"
 }
 
-# is_native FILE: whether programs of this system can load a library; one for 32 bits often lies beside the right one.
+# is_native FILE: whether programs of this system can load a library; a 32-bit library is often installed next to the right one.
 is_native() {
     [ -r "$1" ] && [ "$(elf_machine "$1")" = "$(elf_machine /bin/sh)" ]
 }
@@ -82,7 +82,7 @@ links() {
     return $status
 }
 
-# need_header HEADER LIBRARY PACKAGE REASON: asks for a package unless programs can be linked with the library. A library
+# need_header HEADER LIBRARY PACKAGE REASON: adds the package unless programs can be linked with the library. A library
 # without its -dev package has neither the header nor the name that the linker looks for.
 need_header() {
     if links 'int main(void) { return 0; }\n'; then
@@ -105,18 +105,18 @@ has_lavapipe() {
     return 1
 }
 
-# python_has CODE: whether python3 is there and runs this.
+# python_has CODE: whether python3 is installed and runs this code.
 python_has() {
     python3 -c "$1" >/dev/null 2>&1
 }
 
-# need_pip REASON: a pip that knows the platforms of the wheels (manylinux_2_28, since pip 20.3), and the modules that open them.
+# need_pip REASON: needs a pip that knows the platforms of the wheels (manylinux_2_28, since pip 20.3), and the modules that open wheels.
 need_pip() {
     python_has 'import pip, ssl, sys, zipfile; sys.exit(int(pip.__version__.split(".")[0]) < 21)' || need python3-pip "$1"
 }
 
-# libclang_files: prints the files that may be libclang where the crate clang-sys looks, in its order: LIBCLANG_PATH alone where
-# that is set, else llvm-config's folder, the linker's paths, the folders of the system.
+# libclang_files: prints candidates for libclang in the order of the crate clang-sys: only those in LIBCLANG_PATH if that is set;
+# otherwise llvm-config's folder, the linker's paths, and the system's folders.
 libclang_files() {
     if [ -f "${LIBCLANG_PATH-}" ]; then
         echo "$LIBCLANG_PATH"
@@ -126,7 +126,7 @@ libclang_files() {
         set -- "$LIBCLANG_PATH"
     else
         prefix=$("${LLVM_CONFIG_PATH:-llvm-config}" --prefix 2>/dev/null || true)
-        # Several words are meant.
+        # Word splitting is intended.
         # shellcheck disable=SC2046
         set -- ${prefix:+"$prefix/bin" "$prefix/lib" "$prefix/lib64"} \
             $(echo "${LD_LIBRARY_PATH-}:${LIBRARY_PATH-}" | tr ':' ' ') \
@@ -139,12 +139,12 @@ libclang_files() {
     done
 }
 
-# libclangs: prints version (0 where its name has none) and path of each libclang that can be loaded.
+# libclangs: prints the version (0 if the file name has none) and path of each libclang that can be loaded.
 libclangs() {
     libclang_files | while read -r file; do
         name=${file##*/}
         case "$name" in
-        *-cpp.*) continue ;; # Another library: the one with C++ functions.
+        *-cpp.*) continue ;; # A different library: the C++ interface of clang.
         libclang-*) version=${name#libclang-} version=${version%%.so*} ;;
         libclang.so.*) version=${name#libclang.so.} ;;
         *) version=0 ;;
@@ -153,15 +153,15 @@ libclangs() {
     done
 }
 
-# check_libclang: what the crate bindgen needs: libclang, and the headers of the same clang (stddef.h and others).
+# check_libclang: checks what the crate bindgen needs: libclang, and the headers of the same clang (stddef.h and others).
 check_libclang() {
-    # clang-sys takes the highest version; the order of folders decides among equals.
+    # clang-sys takes the highest version; among equal versions, the first folder wins.
     chosen=$(libclangs | sort -s -t ' ' -k 1,1Vr | head -n 1)
     if [ -z "$chosen" ]; then
         need libclang-dev "builds the feature nokhwa (bindgen loads libclang)"
         return 0
     fi
-    # Where there is a clang command, bindgen takes its search paths.
+    # If there is a clang command, bindgen uses its search paths.
     if echo '#include <stddef.h>' | clang -x c -fsyntax-only - >/dev/null 2>&1; then
         return 0
     fi
@@ -176,11 +176,11 @@ check_libclang() {
     need "libclang${version:+-common-$version}-dev" "headers of clang ${version:+$version }itself, for $library"
 }
 
-# check GROUP: adds what is missing of a group.
+# check GROUP: adds the missing packages of a group.
 check() {
     case "$1" in
     build)
-        # Without its headers and start files a C compiler is no use; gcc only recommends them.
+        # A C compiler is useless without its headers and start files, which gcc only recommends.
         if ! links '#include <stdio.h>\n#include <linux/videodev2.h>\nint main(void) { return puts(""); }\n'; then
             if echo 'int nothing;' | cc -x c -c -o /dev/null - >/dev/null 2>&1; then
                 need libc6-dev "headers and start files of the C library"
@@ -189,7 +189,7 @@ check() {
                 need_package libc6-dev "headers and start files of the C library"
             fi
         fi
-        pkg-config --version >/dev/null 2>&1 || need pkg-config "how build scripts find libraries"
+        pkg-config --version >/dev/null 2>&1 || need pkg-config "lets build scripts find libraries"
         ;;
     gpu)
         need_library libvulkan.so.1 libvulkan1 "the Vulkan loader"
@@ -222,7 +222,7 @@ check() {
         if ! hil_is_supported; then
             return 0
         fi
-        need_file /usr/src/linux-source-6.1.tar.xz linux-source-6.1 "the kernels that play cameras and CAN buses for the tests"
+        need_file /usr/src/linux-source-6.1.tar.xz linux-source-6.1 "source of the kernels that emulate cameras and CAN buses for the tests"
         need_command make make "builds these kernels"
         need_command flex flex "builds these kernels"
         need_command bison bison "builds these kernels"
@@ -233,7 +233,7 @@ check() {
         need_package busybox-static "starts the tests in these kernels"
         need_file /usr/bin/qemu-system-x86_64 qemu-system-x86 "emulates CAN cards for the tests"
         need_file /usr/sbin/ip iproute2 "sets up the CAN cards"
-        python_has 'import ensurepip, venv' || need python3-venv "holds the other ends of Franka arms for the tests"
+        python_has 'import ensurepip, venv' || need python3-venv "runs the Franka simulator and libfranka for the tests"
         ;;
     *)
         echo "install-packages: unknown group $1 (build, gpu, sim, web, nokhwa, realsense, hil)" >&2
@@ -258,7 +258,7 @@ check_all() {
     done
 }
 
-# give_up: ends without having installed everything; that is a failure unless only optional groups lack something.
+# give_up: exits before everything is installed; this is a failure unless only packages of optional groups are missing.
 give_up() {
     if [ "$required" -eq 0 ]; then
         echo "continuing without them: the tests that use them are skipped" >&2
@@ -288,19 +288,19 @@ if $only_check; then
     exit 1
 fi
 if ! command -v apt-get >/dev/null 2>&1; then
-    echo "this system has no apt-get: install the equivalents of these Debian packages with its own package manager" >&2
+    echo "apt-get not found: install the equivalents of these Debian packages with the package manager of this system" >&2
     give_up
 fi
-# A lock that another apt holds is waited for.
+# Wait if another apt holds the lock.
 install="apt-get install -y -q --no-install-recommends -o DPkg::Lock::Timeout=300"
-# Lists of an unreachable repository do not stop the installation.
+# An unreachable repository does not stop the installation.
 line="apt-get update -q; $install$missing"
-# An installation that was interrupted has to be finished first, together with what it depends on.
+# An interrupted installation must be finished first, together with its dependencies.
 if [ -n "$(dpkg --audit 2>/dev/null)" ]; then
     line="dpkg --configure -a; apt-get update -q; $install --fix-broken --no-remove; $install$missing"
 fi
 if [ "$(id -u)" -ne 0 ]; then
-    echo "not running as root; run this line, then try again:" >&2
+    echo "not running as root; run this command, then try again:" >&2
     if command -v sudo >/dev/null 2>&1; then
         echo "    sudo sh -c '$line'" >&2
     else
@@ -318,7 +318,7 @@ fi
 hash -r
 check_all
 if [ -n "$missing" ]; then
-    # Most often another copy comes first on the path, such as an old Node.js in /usr/local or a Python without pip.
+    # The usual cause is another copy earlier on the path, such as an old Node.js in /usr/local or a Python without pip.
     printf 'installed, but still not usable:\n%s' "$reasons" >&2
     for command in cc pkg-config python3 node npm; do
         echo "    $command is $(command -v $command || echo not found)" >&2

@@ -4,10 +4,10 @@
     scripts/interrupt.py target/release/fieldrig FOLDER CASE train|run|record [-n 20] [--seed 1] [--method splat] [--no-hangup]
 
 CASE is one of
-    close   the terminal closes at a random moment; with --no-hangup no SIGHUP comes with it, as after a broken connection
-    head    the reader of stdout goes away after one line
+    close   the terminal closes at a random moment; with --no-hangup without a SIGHUP, as after a broken connection
+    head    the reader of stdout closes the pipe after one line
     full    stdout and stderr are /dev/full
-    disk    the outputs lie on a tmpfs of 6 MB (needs root)
+    disk    the output folder is a tmpfs of 6 MB (needs root)
     kill    only for train: SIGKILL at a random moment after the first checkpoint; the run is then resumed without flags and must end with
             the hash of an uninterrupted one
 
@@ -27,7 +27,7 @@ import time
 from pathlib import Path
 
 PATIENCE_SECS = 300
-# Limits with which a model trains within seconds without a GPU.
+# Limits with which a model trains within seconds even without a GPU.
 SMALL = ["--max-splats", "2000"]
 # What each command prints once it has its first keyframe or image.
 FIRST_WORDS = {"train": b"step", "run": b"step", "record": b"color images"}
@@ -51,7 +51,7 @@ class Trial:
             made.mkdir(parents=True)
 
     def fieldrig(self, *args):
-        """Runs a command that has to succeed; its stdout comes back."""
+        """Runs a command that has to succeed; returns its stdout."""
         done = subprocess.run([self.exe, *map(str, args)], capture_output=True, text=True, timeout=PATIENCE_SECS)
         expect(done.returncode == 0, f"{' '.join(map(str, args))}: {done.stderr[-1500:]}")
         return done.stdout
@@ -71,20 +71,20 @@ class Trial:
         return subprocess.Popen(command, stdin=subprocess.DEVNULL, env=environment, **streams)
 
     def check(self):
-        """Reads what the command left."""
+        """Reads the files that the command left."""
         read = self.folder / "read"
         if self.args.command != "train":
             self.fieldrig("export", self.out / "run.mcap", "--to", "nerfstudio", "--out", read)
         if self.args.command == "record":
-            return "the recording reads"
+            return "the recording can be read"
         models = [self.out / "model", *self.rescued.iterdir()]
         saved = [model for model in models if (model / "splats.ply").is_file()]
         if saved:
             self.fieldrig("export", saved[0], "--to", "spz", "--out", self.folder / "read.spz")
-            return f"the model in {saved[0].name} loads"
+            return f"the model in {saved[0].name} can be loaded"
         expect((self.out / "model/training.ckpt").is_file(), "neither a model nor a checkpoint")
         self.fieldrig("train", self.data, "--resume", self.out / "model", "--out", self.folder / "resumed")
-        return "the checkpoint resumes"
+        return "training resumes from the checkpoint"
 
     def close(self):
         """Closes the terminal at a random moment after the first keyframe."""
@@ -102,9 +102,9 @@ class Trial:
                 close_at = time.monotonic() + wait_secs
         os.close(ours)
         closed = time.monotonic()
-        if self.args.no_hangup:  # It goes on to its end, and nobody waits a minute for that.
+        if self.args.no_hangup:  # It would run for the full minute, so it is stopped.
             time.sleep(3.0)
-            expect(process.poll() is None, "it ended with its terminal")
+            expect(process.poll() is None, "it ended when its terminal closed")
             process.send_signal(signal.SIGINT)
         code = process.wait(PATIENCE_SECS)
         expect(code == 3, f"exit code {code}: {text[-1500:]}")
@@ -127,7 +127,7 @@ class Trial:
 
     def disk(self):
         subprocess.run(["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", self.out], check=True)
-        # From empty to almost full: each file in turn is the one that finds no room.
+        # From empty to almost full, so that writing fails at a different file in each trial.
         (self.out / "filler").write_bytes(bytes(self.random.randrange(6 << 20)))
         command = self.command(10)
         process = self.start(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
@@ -156,8 +156,8 @@ class Trial:
         process.send_signal(signal.SIGKILL)
         was_killed = process.wait() == -signal.SIGKILL
         done = json.loads(self.fieldrig("train", self.data, "--resume", run, "--json").splitlines()[-1])
-        expect(done.get("checkpoint_sha256") == expected["sha256"], f"another hash: {done}")
-        return f"killed {wait_secs:.1f} s after the first checkpoint" if was_killed else "it had ended"
+        expect(done.get("checkpoint_sha256") == expected["sha256"], f"the hash differs: {done}")
+        return f"killed {wait_secs:.1f} s after the first checkpoint" if was_killed else "it had already ended"
 
     def run(self):
         try:
@@ -172,20 +172,20 @@ class Trial:
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("fieldrig", help="the program")
-    parser.add_argument("folder", help="holds the data that is trained on, made where it is missing, and the trials")
+    parser.add_argument("fieldrig", help="path of the fieldrig binary")
+    parser.add_argument("folder", help="folder for the training data, which is created if missing, and for the trials")
     parser.add_argument("case", choices=["close", "head", "full", "disk", "kill"])
     parser.add_argument("command", choices=["train", "run", "record"])
     parser.add_argument("-n", type=int, default=20, help="trials (default 20)")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--rig", default="rigs/static-arm.toml")
-    parser.add_argument("--within", type=float, default=10.0, help="seconds after the first keyframe within which a terminal closes")
-    parser.add_argument("--no-hangup", action="store_true", help="no SIGHUP comes with the end of the terminal")
+    parser.add_argument("--within", type=float, default=10.0, help="the terminal closes at most this many seconds after the first keyframe")
+    parser.add_argument("--no-hangup", action="store_true", help="send no SIGHUP when the terminal closes")
     parser.add_argument("--method", default="splat", help="for kill")
     parser.add_argument("--steps", type=int, default=300, help="for kill")
     args = parser.parse_args()
     if args.case == "kill" and args.command != "train":
-        parser.error("kill is for train")
+        parser.error("the case kill requires the command train")
     data = Path(args.folder).resolve() / "data.mcap"
     data.parent.mkdir(parents=True, exist_ok=True)
     if not data.exists():

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Opens many useless connections to a running server on this computer and measures how long a new viewer waits.
+"""Opens many idle connections to a running server on this computer and measures how long a new viewer waits.
 
     scripts/load-server.py 127.0.0.1:7007
 
-Opens 2000 half-open requests, 500 WebSockets that never send a message, and 32 that never read. Then, ten times, opens the page and a
-WebSocket as a browser does, and asks for a picture. Exits with 1 if a viewer waits for more than a second for its connection.
+Opens 2000 half-open requests, 500 WebSockets that never send a message, and 32 that never read. Then opens the page and a WebSocket as a
+browser does and requests a picture, ten times. Exits with 1 if a viewer waits more than a second for its connection.
 """
 
 import argparse
@@ -71,7 +71,7 @@ def read_frame(stream):
 
 
 def view(address):
-    """Seconds until the page and `hello` are there, and until a picture or its refusal."""
+    """Seconds until the page and `hello` arrive, and until a picture or its refusal arrives."""
     begun = time.monotonic()
     page = connect(address)
     page.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
@@ -115,7 +115,7 @@ def main():
     parser.add_argument("address", help="host and port of the server, a loopback address")
     host, _, port = parser.parse_args().address.rpartition(":")
     if not host.startswith("127.") and host != "localhost":
-        parser.error("only servers on this computer are tested")
+        parser.error("the server must be on this computer (localhost or 127.*)")
     address = (host, int(port))
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
@@ -123,14 +123,14 @@ def main():
     useless = open_useless(address, 2000, "GET / HTTP/1.1\r\nHost: loc")
     useless += open_useless(address, 500, UPGRADE)
     never_reading = open_useless(address, 32, UPGRADE)
-    print(f"{len(useless)} useless connections and {len(never_reading)} clients that never read")
+    print(f"{len(useless)} idle connections and {len(never_reading)} clients that never read")
     viewers, waits, pictures = [], [], []
     for _ in range(N_VIEWERS):
         for stream in never_reading:
             try:
                 send_text(stream, {"type": "ping", "t": 0.0})
             except OSError:
-                pass  # Disconnected, as it should be.
+                pass  # Disconnected, as expected.
         try:
             stream, connected, answered = view(address)
         except OSError as error:
@@ -139,10 +139,10 @@ def main():
         waits.append(connected)
         pictures.append(answered)
         time.sleep(0.3)
-    print(f"new viewers were connected after {max(waits) * 1e3:.0f} ms at most")
-    print(f"their first picture came after {max(pictures) * 1e3:.0f} ms at most")
+    print(f"new viewers connected within {max(waits) * 1e3:.0f} ms")
+    print(f"their first picture arrived within {max(pictures) * 1e3:.0f} ms")
     if max(waits) > MAX_WAIT_SECS:
-        sys.exit(f"a new viewer waited for {max(waits):.2f} s, more than {MAX_WAIT_SECS} s")
+        sys.exit(f"a new viewer waited {max(waits):.2f} s, longer than {MAX_WAIT_SECS} s")
 
 
 if __name__ == "__main__":

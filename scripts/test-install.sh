@@ -1,19 +1,19 @@
 #!/bin/sh
-# Runs the installation scripts in fresh and half-equipped Debian systems: chroots that debootstrap makes.
+# Runs the installation scripts in Debian systems with no packages or only some of them: chroots made with debootstrap.
 #
-# Each state of a system is made, then: install-packages.sh --check must name exactly the packages that it lacks; without root
-# install-packages.sh must print one line to run and fail; as root it must install them; a second run must print nothing; and
-# what was installed is used: a C program is linked, Vulkan and EGL are opened, bindings are generated, the page is bundled.
+# For each state, the script makes such a system and checks: install-packages.sh --check names exactly the missing packages; without
+# root, install-packages.sh prints one command to run and fails; as root it installs them; a second run prints nothing; and the installed
+# packages work: a C program is linked, Vulkan and EGL are opened, bindings are generated, the page is bundled.
 #
-# Needs root, debootstrap, network, and 4 GB in FOLDER; much faster with a FOLDER in memory, such as /dev/shm/test-install.
+# Needs root, debootstrap, network, and 4 GB in FOLDER; much faster if FOLDER is in memory, such as /dev/shm/test-install.
 # Not part of `make test`.
 #
-# usage: test-install.sh [bookworm|trixie]... [STATE]...      both systems and all states where none is named
-#   FOLDER=/tmp/test-install   where the chroots and downloaded packages lie; kept for the next run
-#   MIRROR=ADDRESS             of Debian's packages [default: the first one in this machine's apt settings]
-#   FILES=FOLDER               copied over each chroot, for apt settings, proxies and certificates
-#   BUILD_SCRIPT=FILE          the build script of the crate v4l2-sys-mit, a program that generates bindings. Taken from the target
-#                              folder where it is there: `cargo build -p drivers --features nokhwa` builds it
+# usage: test-install.sh [bookworm|trixie]... [STATE]...      default: both systems and all states
+#   FOLDER=/tmp/test-install   folder for chroots and downloaded packages; kept for the next run
+#   MIRROR=ADDRESS             mirror of Debian's packages [default: the first one in this machine's apt settings]
+#   FILES=FOLDER               files copied over each chroot, for apt settings, proxies and certificates
+#   BUILD_SCRIPT=FILE          build script of the crate v4l2-sys-mit, a program that generates bindings [default: the one in the target
+#                              folder, which `cargo build -p drivers --features nokhwa` builds]
 # Variables for proxies and certificates (http_proxy, https_proxy, no_proxy, SSL_CERT_FILE, PIP_CERT, NODE_EXTRA_CA_CERTS,
 # npm_config_cafile) are passed on.
 set -eu
@@ -21,7 +21,7 @@ cd "$(dirname "$0")/.."
 
 folder=${FOLDER:-/tmp/test-install}
 mirror=${MIRROR:-$(apt-cache policy | awk '$2 ~ /^http/ && $2 !~ /security/ { print $2; exit }')}
-[ -n "$mirror" ] || { echo "test-install: no mirror of Debian in apt's settings: name one with MIRROR=ADDRESS" >&2; exit 1; }
+[ -n "$mirror" ] || { echo "test-install: no Debian mirror in apt's settings; set MIRROR=ADDRESS" >&2; exit 1; }
 suites="" states=""
 for word in "$@"; do
     case "$word" in
@@ -34,7 +34,7 @@ if [ "$(id -u)" -ne 0 ] || ! command -v debootstrap >/dev/null 2>&1; then
     exit 1
 fi
 build_script=${BUILD_SCRIPT:-$(find target -path '*/build/v4l2-sys-mit-*/build-script-build' 2>/dev/null | head -n 1)}
-[ -n "$build_script" ] || echo "test-install: bindings are not generated: no build script of v4l2-sys-mit, see BUILD_SCRIPT"
+[ -n "$build_script" ] || echo "test-install: skipping the generation of bindings: no build script of v4l2-sys-mit, see BUILD_SCRIPT"
 root=$folder/root
 n_failed=0 n_passed=0
 failed=""
@@ -52,7 +52,7 @@ discard() {
 trap unmount EXIT
 trap 'exit 130' HUP INT TERM
 
-# make_base: a minimal system of the suite, once.
+# make_base: makes a minimal system of the suite, once.
 make_base() {
     base=$folder/$suite
     if [ ! -e "$base/.complete" ]; then
@@ -65,20 +65,20 @@ make_base() {
             exit 1
         }
         printf 'deb %s %s main\ndeb %s %s-updates main\n' "$mirror" "$suite" "$mirror" "$suite" >"$base/etc/apt/sources.list"
-        # As on a machine on which apt-get update never ran.
+        # As on a machine that has never run apt-get update.
         rm -rf "$base"/var/lib/apt/lists/* "$base"/var/cache/apt/archives/*.deb
         touch "$base/.complete"
     fi
 }
 
-# make_root: a copy of the minimal system in which scripts can run, with the checkout in /src.
+# make_root: makes a copy of the minimal system in which scripts can run, with the checkout in /src.
 make_root() {
     discard
     cp -a --reflink=auto "$base" "$root"
     cp /etc/resolv.conf "$root/etc/resolv.conf"
     [ -z "${FILES-}" ] || cp -a "$FILES/." "$root/"
     mkdir -p "$root/src" "$root/var/cache/apt/archives"
-    # Thousands of files that nobody keeps: they need not reach the disk.
+    # Thousands of temporary files: they need not reach the disk.
     echo force-unsafe-io >"$root/etc/dpkg/dpkg.cfg.d/unsafe-io"
     git ls-files -z -co --exclude-standard | tar --create --null --ignore-failed-read --files-from=- 2>/dev/null |
         tar --extract --directory "$root/src" --no-same-owner
@@ -101,21 +101,21 @@ inside() {
     root) as= ;;
     *) as="setpriv --reuid=$user --clear-groups" ;;
     esac
-    # Several words are meant.
+    # Word splitting is intended.
     # shellcheck disable=SC2086
     chroot "$root" $as env -i HOME=/tmp LANG=C.UTF-8 DEBIAN_FRONTEND=noninteractive \
         PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin "$@" sh -c "$commands"
 }
 
-# fail TEXT: notes that this state failed.
+# fail TEXT: records a failure of this state.
 fail() {
     echo "FAILED $suite $name: $1"
     problems=$((problems + 1))
 }
 
-# state NAME GROUPS PACKAGES: a system made by the commands on stdin, the groups asked for, and the packages that are missing then.
-# Variables: `unusable=true` where another program hides what is installed; `run_line=true` runs the line that is printed without root
-# in place of the script; `environment` holds variables of the script.
+# state NAME GROUPS PACKAGES: tests a system that the commands on stdin set up: groups to install, and packages expected to be missing.
+# Variables: `unusable=true` if another program hides what is installed; `run_line=true` runs the command that is printed without root
+# instead of the script; `environment` holds environment variables for the script.
 state() {
     name=$1 groups=$2 expected=$3
     equipment=$(cat)
@@ -127,33 +127,33 @@ state() {
     log=$folder/$suite-$name.log
     make_root
     if ! inside "set -e; $equipment" >"$log" 2>&1; then
-        fail "the state could not be made, see $log"
+        fail "the state could not be set up, see $log"
         finish
         return
     fi
 
     found=$(inside "$environment scripts/install-packages.sh --check $groups" 2>&1 |
         sed -n 's/^    \([^ :]*\): .*/\1/p' | sort | xargs)
-    [ "$found" = "$expected" ] || fail "missing are '$expected', found '$found'"
+    [ "$found" = "$expected" ] || fail "expected '$expected' to be missing, found '$found'"
 
     status=0
     user=65534
     inside "$environment scripts/install-packages.sh $groups" >"$folder/out" 2>&1 || status=$?
     user=root
     lines=$(grep -cE '^ +(sudo|su) .*apt-get install' "$folder/out" || true)
-    [ "$status $lines" = "$([ -n "$expected" ] && echo 1 1 || echo 0 0)" ] || fail "without root: exit code $status, $lines lines to run"
+    [ "$status $lines" = "$([ -n "$expected" ] && echo 1 1 || echo 0 0)" ] || fail "without root: exit code $status, $lines commands to run"
 
     status=0
     if $run_line; then
-        # The printed line, as a person would paste it.
+        # Run the printed command as a person would paste it.
         line=$(sed -nE "s/^ +(sudo sh|su -) -c '(.*)'$/\2/p" "$folder/out")
         inside "$line" >>"$log" 2>&1 || status=$?
     else
         inside "$environment scripts/install-packages.sh $groups" >>"$log" 2>&1 || status=$?
     fi
     if $unusable; then
-        [ "$status" -eq 1 ] || fail "exit code $status where what is installed is hidden"
-        grep -q 'installed, but still not usable' "$log" || fail "does not print that what is installed is not usable, see $log"
+        [ "$status" -eq 1 ] || fail "exit code $status, expected 1: the installed program is hidden"
+        grep -q 'installed, but still not usable' "$log" || fail "no message that the installed packages are not usable, see $log"
     else
         [ "$status" -eq 0 ] || fail "as root: exit code $status, see $log"
         inside "$environment scripts/install-packages.sh --check $groups" >"$folder/out" 2>&1 || fail "still missing: $(cat "$folder/out")"
@@ -166,7 +166,7 @@ state() {
     finish
 }
 
-# finish: counts the state.
+# finish: counts the state as passed or failed.
 finish() {
     if [ $problems -eq 0 ]; then
         n_passed=$((n_passed + 1))
@@ -177,7 +177,7 @@ finish() {
     fi
 }
 
-# cargo_state: check-cargo.sh without cargo, with one that is not on the path, with Debian's older one, with the right one.
+# cargo_state: tests check-cargo.sh without cargo, with a cargo that is not on the path, with Debian's older one, and with the right one.
 cargo_state() {
     name=cargo
     case "$states " in
@@ -187,13 +187,13 @@ cargo_state() {
     problems=0
     make_root
     wanted=$(sed -n 's/^channel = "\(.*\)"$/\1/p' rust-toolchain.toml)
-    # prints EXPECTED COMMANDS: what check-cargo.sh has to print, as a pattern, when it fails after these commands; nothing when it passes.
+    # prints EXPECTED COMMANDS: what check-cargo.sh must print (a pattern) when it fails after these commands; empty if it must pass.
     prints() {
         status=0
         inside "$2; scripts/check-cargo.sh" >"$folder/out" 2>&1 || status=$?
         if [ -n "$1" ]; then
             [ "$status" -eq 1 ] || fail "exit code $status, expected 1, after: $2"
-            grep -q "$1" "$folder/out" || fail "does not print '$1', but: $(cat "$folder/out")"
+            grep -q "$1" "$folder/out" || fail "expected '$1', printed: $(cat "$folder/out")"
         else
             [ "$status$(cat "$folder/out")" = 0 ] || fail "exit code $status after: $2: $(cat "$folder/out")"
         fi
@@ -202,7 +202,7 @@ cargo_state() {
     prints 'apt-get install .* curl' true
     prints 'sh.rustup.rs' true
     mkdir -p "$root/tmp/.cargo/bin"
-    # reports FILE VERSION: commands that put a cargo of this version there.
+    # reports FILE VERSION: prints commands that install a fake cargo of this version as FILE.
     reports() {
         printf '%s\n' "printf '#!/bin/sh\\necho cargo $2\\n' >$1; chmod +x $1"
     }
@@ -216,7 +216,7 @@ cargo_state() {
 
 # The commands below use what a group installed.
 
-# use_c NAME: links and runs the program on stdin; only where the group build was installed, too.
+# use_c NAME: links and runs the program on stdin, if the group build was installed too.
 use_c() {
     cat >"$root/tmp/use.c"
     case " $groups " in
@@ -315,7 +315,7 @@ use_hil() {
         qemu-system-x86_64 --version && ip -V && busybox true' >>"$log" 2>&1 || fail "the tools of the group hil do not run, see $log"
 }
 
-# install PACKAGE...: a line of a state's equipment.
+# Begins the commands that install packages in a state.
 install="apt-get update -q; apt-get install -y -q --no-install-recommends"
 
 for suite in ${suites:-bookworm trixie}; do
@@ -343,7 +343,7 @@ for suite in ${suites:-bookworm trixie}; do
 
     cargo_state
 
-    # What is printed without root does it all.
+    # The command that is printed without root must install everything.
     run_line=true
     state printed-line "build gpu sim web nokhwa" "$(sorted "$build" "$gpu" "$sim" nodejs npm libclang-dev)" </dev/null
     run_line=false
@@ -354,7 +354,7 @@ EQUIP
     state vulkan-loader-only "build gpu" mesa-vulkan-drivers <<EQUIP
         $install $build libvulkan1
 EQUIP
-    # Programs for 32 bits bring libraries of the same names.
+    # 32-bit programs bring libraries of the same names.
     state libraries-of-another-processor "build gpu sim" "$(sorted "$gpu" "$sim")" <<EQUIP
         dpkg --add-architecture i386
         $install $build libvulkan1:i386 mesa-vulkan-drivers:i386 libegl1:i386 libegl-mesa0:i386 libgl1-mesa-dri:i386
@@ -368,7 +368,7 @@ EQUIP
     state python-without-pip-or-venv "sim hil" "$(sorted "$sim" "$hil")" <<EQUIP
         $install python3
 EQUIP
-    # The files of an LLVM: libclang-cpp.so is there, libclang.so is not.
+    # An LLVM installation: libclang-cpp.so is there, libclang.so is not.
     state llvm-without-libclang "nokhwa" libclang-dev <<EQUIP
         $install llvm-$llvm-dev
         ls /usr/lib/llvm-$llvm/lib/libclang-cpp*.so*
@@ -385,12 +385,12 @@ EQUIP
 EQUIP
     environment=""
     if [ "$suite" = bookworm ]; then
-        # The newest one is taken, and it has no headers.
+        # clang-sys takes the newest one, which has no headers.
         state newer-libclang-without-its-headers "nokhwa" libclang-common-16-dev <<EQUIP
             $install libclang-dev libclang1-16
 EQUIP
     fi
-    # Libraries that programs load, without the -dev packages that programs are built with.
+    # Libraries that programs load at run time, without the -dev packages that builds need.
     state libraries-without-headers "build realsense hil" "$(sorted patchelf python3-pip "$hil")" <<EQUIP
         $install $build $runtime
 EQUIP

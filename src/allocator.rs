@@ -1,21 +1,21 @@
 //! Settings of the C library's allocator.
 //!
-//! glibc serves large blocks with mappings of their own, which go back to the system when they are freed. When such a block is
-//! freed, however, it raises the size from which it does so, up to 32 MiB. Images then share heaps with everything else, and the
-//! heaps of a long run grow though no more of them is in use: keyframes come and go, and what lies between them stays. A fixed size
-//! keeps images out of the heaps.
+//! glibc serves large blocks from separate memory mappings, which return to the system when the blocks are freed. Freeing such a
+//! block, however, raises the size from which glibc does so, up to 32 MiB. Images then share heaps with everything else, and in a
+//! long run the heaps fragment and grow, although no more memory is in use: keyframes are freed, but blocks between them stay.
+//! A fixed threshold keeps images out of the heaps.
 //!
-//! It also has a price: a block with a mapping of its own is cleared page by page when it is first written. Pictures for viewers are
-//! such blocks, and on a GPU that draws one in a millisecond that is most of their time (H200, 1024x1024 with depth, 8 clients: 105 ms
+//! This has a cost: the kernel clears a mapped block page by page when it is first written. Pictures for viewers are such blocks,
+//! and on a GPU that draws one in a millisecond, that takes most of their time (H200, 1024x1024 with depth, 8 clients: 105 ms
 //! from request to picture rather than 45). So the setting is for software adapters, where drawing takes far longer and images take
 //! host memory twice.
 
-/// Blocks of at least this size get a mapping of their own: an image of 640x480 has 1.2 MB.
+/// Blocks of at least this size get a separate mapping: an image of 640x480 has 1.2 MB.
 const MAP_FROM_BYTES: i32 = 1 << 20;
-/// Free memory at the end of a heap past which it goes back to the system, the double of the above as glibc chooses it.
+/// Free memory at the end of a heap above which it returns to the system: twice the size above, as in glibc.
 const TRIM_BYTES: i32 = 2 * MAP_FROM_BYTES;
 
-/// Keeps large blocks out of the heaps; settings in the environment go first.
+/// Keeps large blocks out of the heaps, unless the environment sets the allocator's thresholds.
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
 pub(crate) fn keep_images_out_of_heaps() {
     let is_set = |name: &str| std::env::var_os(name).is_some();
@@ -29,11 +29,11 @@ pub(crate) fn keep_images_out_of_heaps() {
         [libc::mallopt(libc::M_MMAP_THRESHOLD, MAP_FROM_BYTES), libc::mallopt(libc::M_TRIM_THRESHOLD, TRIM_BYTES)]
     };
     if results.contains(&0) {
-        log::debug!("the allocator refused its settings: a long run takes more memory");
+        log::debug!("the allocator rejected its settings: a long run will take more memory");
     }
 }
 
-/// Other allocators have nothing to set.
+/// Does nothing: other allocators have no such setting.
 #[cfg(not(all(target_os = "linux", target_env = "gnu")))]
 pub(crate) fn keep_images_out_of_heaps() {}
 
@@ -41,7 +41,7 @@ pub(crate) fn keep_images_out_of_heaps() {}
 mod tests {
     use super::*;
 
-    /// Bytes of blocks with mappings of their own.
+    /// Bytes of blocks with separate mappings.
     fn mapped_bytes() -> usize {
         #[expect(unsafe_code, reason = "the allocator has no other interface")]
         // SAFETY: `mallinfo2` only reads the allocator's counters, under its lock.
@@ -52,12 +52,12 @@ mod tests {
     #[test]
     fn images_have_mappings_of_their_own_after_others_were_freed() {
         keep_images_out_of_heaps();
-        // Without the setting this block, once freed, takes the images below into a heap.
+        // Without the setting, freeing this block would put the images below into a heap.
         drop(vec![1u8; 24 << 20]);
         let before = mapped_bytes();
         let images: Vec<Vec<u8>> = (0..64).map(|ix| vec![ix; 4 * 640 * 480]).collect();
         let grown = mapped_bytes().saturating_sub(before);
-        // Other tests allocate meanwhile.
+        // Other tests allocate at the same time.
         assert!(grown >= 32 * 4 * 640 * 480, "{grown} bytes of {} are mapped", images.len() * 4 * 640 * 480);
     }
 }

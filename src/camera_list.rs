@@ -1,4 +1,4 @@
-//! The cameras of a run's keyframes, in `cameras.json` beside the model: a viewer starts from them and draws them.
+//! The cameras of a run's keyframes, in `cameras.json` beside the model, for viewers to start from and to draw.
 
 use crate::camera_path;
 use anyhow::Context;
@@ -28,7 +28,7 @@ struct File {
     cameras: Vec<PosedCamera>,
 }
 
-/// Writes the list, one camera a line.
+/// Writes the list, one camera per line.
 pub(crate) fn write(folder: &Path, cameras: &[PosedCamera]) -> anyhow::Result<()> {
     let lines: Vec<String> = cameras.iter().map(serde_json::to_string).collect::<Result<_, _>>()?;
     let path = folder.join(FILE);
@@ -36,7 +36,7 @@ pub(crate) fn write(folder: &Path, cameras: &[PosedCamera]) -> anyhow::Result<()
     std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))
 }
 
-/// Reads the list; `None` where the folder has none.
+/// Reads the list; `None` if the folder has none.
 pub(crate) fn read(folder: &Path) -> anyhow::Result<Option<Vec<KeyframePose>>> {
     let path = folder.join(FILE);
     let text = match std::fs::read_to_string(&path) {

@@ -11,28 +11,28 @@ use std::time::{Duration, Instant};
 use trainer::checkpoint::{Checkpoint, PendingCheckpoint};
 use trainer::{Keyframe, Method};
 
-/// Time between two checkpoints where no flag says.
+/// Time between two checkpoints unless a flag sets it.
 const DEFAULT_PERIOD: Duration = Duration::from_secs(60);
-/// Time after which new keyframes of a live run are written.
+/// Time between two writes of new keyframes in a live run.
 const KEYFRAME_PERIOD: Duration = Duration::from_secs(2);
-/// The flag in a checkpoint.
+/// Name of the flag in checkpoints.
 const CHECKPOINT_SECS: &str = "checkpoint-secs";
 
 /// How often checkpoints are written.
 #[derive(Clone, Copy, Debug, clap::Args)]
 pub(crate) struct CheckpointArgs {
-    /// Write all that training needs to go on every S seconds and at the end, for `--resume`; 0: never [default: 60]
+    /// Write the state of training every S seconds and at the end, for `--resume`; 0: never [default: 60]
     #[arg(long, value_name = "S", value_parser = secs)]
     checkpoint_secs: Option<Duration>,
 }
 
 impl CheckpointArgs {
-    /// The flag as a resumed run finds it in the checkpoint, if it is given.
+    /// The flag as it is stored in a checkpoint, if it is given.
     pub(crate) fn flag(self) -> Option<(String, String)> {
         Some((CHECKPOINT_SECS.to_owned(), self.checkpoint_secs?.as_secs_f64().to_string()))
     }
 
-    /// This flag, or where it is not given the one of the run that is resumed.
+    /// This flag, or if it is not given, that of the earlier run.
     pub(crate) fn or_earlier(self, flags: &BTreeMap<String, String>) -> Self {
         let earlier = || flags.get(CHECKPOINT_SECS).and_then(|text| secs(text).ok());
         Self { checkpoint_secs: self.checkpoint_secs.or_else(earlier) }
@@ -50,12 +50,12 @@ pub(crate) fn read(folder: &Path) -> anyhow::Result<Checkpoint> {
     Checkpoint::read(&folder.join(CHECKPOINT)).with_context(|| format!("nothing to go on from in {}", folder.display()))
 }
 
-/// What every checkpoint of a run says beside the state of its model.
+/// What every checkpoint of a run holds besides the state of its model.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct RunFlags {
     /// SHA-256 of the model that depth was drawn from.
     pub(crate) depth_from: Option<String>,
-    /// Flags of the run: those that keyframes were made by, and where training ends.
+    /// Flags of the run: those that affect its keyframes, and its limit.
     pub(crate) flags: BTreeMap<String, String>,
 }
 
@@ -67,29 +67,29 @@ pub(crate) struct Checkpoints {
     /// Time after the last one at which the next is due.
     due_after: Duration,
     last: Instant,
-    /// Where keyframes are kept that no data on disk holds.
+    /// Keyframes that are on disk nowhere else.
     kept_keyframes: Option<KeptKeyframes>,
     last_keyframes: Instant,
     writing: Option<Writing>,
-    /// Whether this run has written one.
+    /// Whether this run has written a checkpoint.
     has_any: bool,
 }
 
-/// What a thread writes.
+/// A thread that writes.
 struct Writing {
     thread: JoinHandle<anyhow::Result<()>>,
-    /// Whether it is a checkpoint, not keyframes alone.
+    /// Whether it writes a checkpoint, not only keyframes.
     is_checkpoint: bool,
 }
 
-/// A model in training as a checkpoint takes it.
+/// A model in training and what else goes into its checkpoint.
 pub(crate) struct Snapshot<'a> {
     pub(crate) method: &'a mut dyn Method,
-    /// Those it holds, for testing too.
+    /// All keyframes held, test keyframes included.
     pub(crate) keyframes: &'a [Arc<Keyframe>],
     /// Seconds of training.
     pub(crate) seconds: f64,
-    /// Whether training reached its end.
+    /// Whether training has reached its limit.
     pub(crate) is_finished: bool,
 }
 
@@ -110,13 +110,13 @@ impl Checkpoints {
         })
     }
 
-    /// Writes these into each.
+    /// Stores these flags in each checkpoint.
     pub(crate) fn with_flags(self, run_flags: RunFlags) -> Self {
         Self { run_flags, ..self }
     }
 
-    /// Keeps the keyframes too: for a live run, whose images are nowhere else. The first checkpoint is written with the first keyframes,
-    /// because a run is resumed only from both.
+    /// Stores the keyframes too: for a live run, whose images are nowhere else. The first checkpoint is written with the first keyframes,
+    /// because resuming needs both.
     pub(crate) fn with_keyframes(self, run: &Path) -> Self {
         let due_after = self.every.min(KEYFRAME_PERIOD);
         Self { kept_keyframes: Some(KeptKeyframes::of_run(run)), due_after, ..self }
@@ -147,7 +147,7 @@ impl Checkpoints {
         Ok(false)
     }
 
-    /// Begins one of the current state, after the one under way.
+    /// Starts a checkpoint of the current state, after the one in progress.
     pub(crate) fn begin(&mut self, now: Snapshot<'_>) -> Result<(), trainer::Error> {
         let job = self.take(now)?;
         self.write(job);
@@ -159,7 +159,7 @@ impl Checkpoints {
         self.wait_and_warn();
         let asked = Instant::now();
         let pending = now.method.checkpoint()?;
-        log::debug!("a checkpoint held training up for {:?}", asked.elapsed());
+        log::debug!("a checkpoint paused training for {:?}", asked.elapsed());
         Ok(Job {
             pending,
             seconds: now.seconds,
@@ -170,7 +170,7 @@ impl Checkpoints {
         })
     }
 
-    /// Writes a copy on a thread of its own.
+    /// Writes a copy on a separate thread.
     pub(crate) fn write(&mut self, job: Job) {
         let thread = std::thread::spawn(move || job.write());
         self.writing = Some(Writing { thread, is_checkpoint: true });
@@ -182,16 +182,16 @@ impl Checkpoints {
         let is_checkpoint = self.writing.as_ref().is_some_and(|writing| writing.is_checkpoint);
         match self.wait() {
             Ok(()) => {}
-            Err(error) if is_checkpoint => log::warn!("no checkpoint was written, the one before stays: {error:#}"),
-            // The next checkpoint needs them, and says what is wrong if that still holds.
-            Err(error) => log::debug!("keyframes were not written: {error:#}"),
+            Err(error) if is_checkpoint => log::warn!("cannot write a checkpoint, the previous one stays: {error:#}"),
+            // The next checkpoint stores them too, and warns if that fails.
+            Err(error) => log::debug!("cannot store keyframes: {error:#}"),
         }
     }
 
-    /// Where the newest one that this run has written lies. One under way that cannot be written any more is given up.
+    /// Path of the newest checkpoint of this run. If the one in progress fails, the previous one counts.
     pub(crate) fn newest(&mut self) -> Option<&Path> {
         if let Err(error) = self.wait() {
-            log::warn!("the checkpoint under way was not written: {error:#}");
+            log::warn!("the checkpoint in progress failed: {error:#}");
         }
         self.has_any.then_some(&self.path)
     }
@@ -210,7 +210,7 @@ impl Checkpoints {
     }
 }
 
-/// A checkpoint on its way to the disk.
+/// A checkpoint that is being written.
 pub(crate) struct Job {
     pending: PendingCheckpoint,
     seconds: f64,
@@ -221,7 +221,7 @@ pub(crate) struct Job {
 }
 
 impl Job {
-    /// Writes the keyframes that the checkpoint needs before it, and removes those that only the one before needed after it.
+    /// Writes new keyframes, then the checkpoint, then removes the keyframes that only the previous checkpoint needed.
     fn write(self) -> anyhow::Result<()> {
         let begun = Instant::now();
         let RunFlags { depth_from, flags } = self.run_flags;

@@ -16,7 +16,7 @@ use clap::{ArgAction, Parser, Subcommand};
                   Exit codes: 0 done, 1 failed, 2 bad arguments, 3 done with loss, 4 refused for lack of evidence.\n\
                   A loss is data that came, or should have come, and is not in the result: images that devices lost or that \
                   do not decode, recordings cut off. Each is named on stderr and, by train and run, in report.json. \
-                  Output lines that could not be written count, too."
+                  Output lines that could not be written are losses, too."
 )]
 pub(crate) struct Cli {
     /// Say more on stderr; twice for everything

@@ -57,7 +57,7 @@ impl DataArgs {
         given.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?))).collect()
     }
 
-    /// The flags that make the pixels of listed keyframes what they were, as words of a command line.
+    /// The flags that affect the pixels of listed keyframes, as words of a command line.
     pub(crate) fn flags_of_images(&self) -> Vec<String> {
         let rig = self.rig.as_ref().map(|file| ["--rig".to_owned(), file.display().to_string()]);
         let scale = self.scale.map(|scale| ["--scale".to_owned(), scale.to_string()]);

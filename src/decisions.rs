@@ -72,7 +72,7 @@ impl Settings {
 }
 
 impl Settings {
-    /// The settings of a run that continues from a checkpoint of this many updates, or begins anew.
+    /// The settings of a run that continues from a checkpoint after this many updates, or restarts.
     pub(crate) fn after(&self, from_step: Option<u64>) -> Self {
         Self { from_step, ..self.clone() }
     }

@@ -59,7 +59,7 @@ pub(crate) struct ImageScores {
     /// dB of the delivered image against the noise-free one; in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) psnr_ceiling: Option<f64>,
-    /// Share of its pixels that the model covers; `None` where the picture stayed on the GPU.
+    /// Share of its pixels that the model covers; `None` if the picture stayed on the GPU.
     #[serde(skip)]
     pub(crate) seen_frac: Option<f64>,
 }
@@ -135,7 +135,7 @@ impl Evaluator {
         })
     }
 
-    /// Scores one test keyframe; an error names it.
+    /// Scores one test keyframe; an error names the keyframe.
     pub(crate) fn score_named(&self, method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<ImageScores> {
         self.score(method, keyframe)
             .with_context(|| format!("test image of {:?} at {} ns", keyframe.camera, keyframe.stamp.0))
@@ -235,8 +235,8 @@ pub(crate) fn draw(method: &mut dyn Method, keyframe: &Keyframe, depth: bool) ->
     Ok(picture)
 }
 
-/// PSNR of the picture that [`draw`] draws against the image of the keyframe, without reading the picture back: equal to the
-/// last bit. `None` where the method cannot do that, or the picture is brightened after it was drawn.
+/// PSNR of the picture that [`draw`] draws against the image of the keyframe, without reading the picture back: the same bits.
+/// `None` if the method cannot do that, or if the picture is brightened after it is drawn.
 fn psnr_on_gpu(method: &mut dyn Method, keyframe: &Keyframe) -> Result<Option<f64>, trainer::Error> {
     let lens = method.posed_lens(keyframe)?;
     if lens.gains == [1.0; 3] { method.psnr(&request(keyframe, &lens), keyframe) } else { Ok(None) }

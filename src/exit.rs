@@ -22,7 +22,7 @@ pub(crate) enum Exit {
 }
 
 impl Exit {
-    /// A command that made its result but could not print all about it ends with a loss.
+    /// A command that succeeded but could not print all of its output ends with a loss.
     pub(crate) fn or_lost_output(self) -> Self {
         if self == Self::Done && print::lost_output() { Self::Loss } else { self }
     }
@@ -66,12 +66,12 @@ pub(crate) fn after(losses: &[String]) -> Exit {
     if losses.is_empty() { Exit::Done } else { Exit::Loss }
 }
 
-/// Whether a file could not be written or read, as on a full disk.
+/// Whether reading or writing a file failed, for example on a full disk.
 pub(crate) fn is_io(error: &anyhow::Error) -> bool {
     error.chain().any(|cause| cause.is::<std::io::Error>())
 }
 
-/// Whether whoever read our output went away, as `head` does: the end of a command whose result is its output.
+/// Whether the reader of our output closed the pipe, as `head` does. This ends a command whose result is its output.
 pub(crate) fn is_broken_pipe(error: &anyhow::Error) -> bool {
     let is_pipe = |io: &std::io::Error| io.kind() == ErrorKind::BrokenPipe;
     error.downcast_ref::<crate::print::StdoutError>().is_some_and(|error| is_pipe(&error.0))

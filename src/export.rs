@@ -20,7 +20,7 @@ const TEST_LIST: &str = "test.txt";
 const LISTS: [(&str, Split); 3] =
     [("train_filenames", Split::Train), ("val_filenames", Split::Selection), ("test_filenames", Split::Test)];
 
-/// What a dataset's folder holds.
+/// The entries of a dataset folder.
 const ENTRIES: [&str; 5] = [IMAGES, MASKS, DEPTH, TEST_LIST, nerfstudio::FILE_NAME];
 const IMAGES: &str = "images";
 const MASKS: &str = "masks";
@@ -41,7 +41,7 @@ pub(crate) struct Written {
 pub(crate) fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<Keyframe>>) -> anyhow::Result<Written> {
     let transforms = out.join(nerfstudio::FILE_NAME);
     if let Some(there) = ENTRIES.iter().map(|entry| out.join(entry)).find(|entry| entry.exists()) {
-        bail!("{} is there already: name another folder", there.display());
+        bail!("{} already exists: name another folder", there.display());
     }
     let partial = Partial::folder(out, &ENTRIES);
     let mut written = Written::default();
@@ -247,6 +247,6 @@ mod tests {
         assert!(write_nerfstudio(folder.path(), std::iter::empty()).unwrap_err().to_string().contains("no keyframe"));
         write_nerfstudio(folder.path(), std::iter::once(Arc::new(keyframe(0)))).unwrap();
         let again = write_nerfstudio(folder.path(), std::iter::once(Arc::new(keyframe(0)))).unwrap_err();
-        assert!(again.to_string().contains("is there already"), "{again}");
+        assert!(again.to_string().contains("already exists"), "{again}");
     }
 }

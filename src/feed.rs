@@ -19,7 +19,7 @@ use viz::{Hub, LiveImage, LivePixels};
 /// Keyframes that may wait for the trainer. When they do, the source waits too, and live devices drop (and count) images.
 const MAX_WAITING: usize = 8;
 
-/// A live image that seems older than this has a stamp on another clock, such as a simulator's.
+/// A live image that seems older than this was stamped by another clock, such as a simulator's.
 const MAX_LIVE_AGE_SECS: f64 = 60.0;
 
 /// A change of the set of keyframes.
@@ -51,7 +51,7 @@ pub(crate) struct Input {
     /// Where the base walks.
     pub(crate) stands: Option<Stands>,
     pub(crate) recorder: Option<Recorder>,
-    /// Whether devices are read as they run; the stamps of a recording are from another time.
+    /// Whether devices are read in real time; the stamps of a recording are from another time.
     pub(crate) is_live: bool,
     /// Focal length and principal point of every camera, pixels.
     pub(crate) lenses: HashMap<Arc<str>, ([f64; 2], [f64; 2])>,
@@ -252,7 +252,7 @@ impl Pump {
         });
     }
 
-    /// When an image was captured. Where its stamp is not on our clock (recordings, simulations), that is the present.
+    /// When an image was captured; now, if its stamp is on another clock (recordings, simulations).
     fn captured_at(&self, stamp: Stamp) -> Instant {
         let now = Instant::now();
         let age_secs = clock::now().secs_since(stamp);

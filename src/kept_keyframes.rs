@@ -1,7 +1,7 @@
-//! The keyframes of a live run on disk, beside its checkpoint: what `run --resume` needs to continue.
+//! Stores the keyframes of a live run on disk, next to its checkpoint, for `run --resume`.
 //!
-//! Each keyframe is a file of its own, in the layout of a checkpoint (`docs/saving.md`) with its pixels and depth as PNG.
-//! What only a simulator knows is left out.
+//! Each keyframe is a separate file in the layout of a checkpoint (`docs/saving.md`), with its color and depth as PNG.
+//! Ground truth from a simulator is left out.
 
 use crate::exit::BadArgument;
 use crate::join::{split_name, split_named};
@@ -19,7 +19,7 @@ use std::sync::Arc;
 use trainer::checkpoint::{Array, Checkpoint};
 use trainer::{BasePlace, DepthMap, Keyframe};
 
-/// The folder, in that of a run.
+/// Name of the folder in the folder of a run.
 pub(crate) const FOLDER: &str = "keyframes";
 const ENDING: &str = "keyframe";
 const METHOD: &str = "keyframe";
@@ -32,7 +32,7 @@ pub(crate) struct KeptKeyframes {
     folder: PathBuf,
 }
 
-/// All of a keyframe but its pixels.
+/// All of a keyframe except its pixels.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Description {
@@ -81,12 +81,12 @@ pub(crate) fn refuse_unfinished(out: &Path) -> Result<(), BadArgument> {
 }
 
 impl KeptKeyframes {
-    /// Those of the run in a folder; nothing is read or written yet.
+    /// The stored keyframes of the run in this folder; nothing is read or written yet.
     pub(crate) fn of_run(run: &Path) -> Self {
         Self { folder: run.join(FOLDER) }
     }
 
-    /// Writes the keyframes that are not there yet.
+    /// Writes the keyframes that are not stored yet.
     pub(crate) fn add(&self, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
         std::fs::create_dir_all(&self.folder).with_context(|| format!("cannot make {}", self.folder.display()))?;
         let there = self.names()?;
@@ -99,7 +99,7 @@ impl KeptKeyframes {
         Ok(())
     }
 
-    /// Removes all files but those of these keyframes.
+    /// Removes all files except those of these keyframes.
     pub(crate) fn keep_only(&self, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
         let kept: BTreeSet<String> = keyframes.iter().map(|keyframe| name_of(keyframe)).collect();
         for name in self.names()?.difference(&kept) {
@@ -109,7 +109,7 @@ impl KeptKeyframes {
         Ok(())
     }
 
-    /// Reads all, in the order of their stamps.
+    /// Reads all keyframes, ordered by stamp.
     pub(crate) fn read(&self) -> anyhow::Result<Vec<Arc<Keyframe>>> {
         let mut keyframes = Vec::new();
         for name in self.names()? {
@@ -215,12 +215,12 @@ fn keyframe_of(container: &Checkpoint) -> anyhow::Result<Keyframe> {
             world_from_told: transform(base.world_from_told),
             truth: None,
         }),
-        split: split_named(&about.split).with_context(|| format!("there is no split {:?}", about.split))?,
+        split: split_named(&about.split).with_context(|| format!("unknown split {:?}", about.split))?,
         truth: None,
     })
 }
 
-/// Four bytes a pixel, without loss. Depth is stored so, too: the bytes of an f32 differ little from one pixel to the next.
+/// Encodes four bytes per pixel without loss. Depth is stored the same way: the bytes of an f32 differ little between neighbors.
 fn png([width, height]: [u32; 2], bytes: &[u8]) -> anyhow::Result<Vec<u8>> {
     let mut png = Vec::new();
     let encoder = PngEncoder::new_with_quality(&mut png, CompressionType::Fast, FilterType::Sub);
@@ -228,14 +228,14 @@ fn png([width, height]: [u32; 2], bytes: &[u8]) -> anyhow::Result<Vec<u8>> {
     Ok(png)
 }
 
-/// A translation, then a quaternion with its real part last.
+/// Three numbers of the translation, then the quaternion with its real part last.
 fn numbers(pose: &Transform) -> [f64; 7] {
     let [x, y, z] = pose.translation.vector.into();
     let [i, j, k, w] = pose.rotation.coords.into();
     [x, y, z, i, j, k, w]
 }
 
-/// The inverse of [`numbers`], to the last bit.
+/// The bit-exact inverse of [`numbers`].
 fn transform([x, y, z, i, j, k, w]: [f64; 7]) -> Transform {
     Transform::from_parts(Translation3::new(x, y, z), UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k)))
 }

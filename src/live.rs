@@ -17,9 +17,9 @@ const PUBLISH_EVERY: Duration = Duration::from_millis(250);
 const IDLE: Duration = Duration::from_millis(10);
 /// Share of the time that goes into scores between the marks.
 const SCORE_FRAC: f64 = 0.03;
-/// While it waits for a keyframe or a request for a picture, it looks for keyframes this often.
+/// How often to check for keyframes while waiting for a keyframe or a picture request.
 const LOOK_EVERY: Duration = Duration::from_millis(2);
-/// Pictures are drawn for this long before anything else gets its turn.
+/// Pictures are drawn for at most this long before other work continues.
 const MAX_RENDER_TIME: Duration = Duration::from_millis(100);
 
 /// What sets the pace.
@@ -47,7 +47,7 @@ pub(crate) struct Live {
     /// Step of each session at which the next keyframe is due in lockstep.
     next_keyframe_at: Vec<u64>,
     budget: RenderBudget,
-    /// Session whose newest score is refreshed next.
+    /// Session whose latest score is refreshed next.
     next_refreshed: usize,
     published: Option<Instant>,
     scoring: Duration,
@@ -76,7 +76,7 @@ impl Live {
         }
     }
 
-    /// Continues with the keyframes of an earlier run, which the sessions hold already.
+    /// Continues with the keyframes of an earlier run, which the sessions already hold.
     pub(crate) fn after(mut self, keyframes: Vec<Arc<Keyframe>>) -> Self {
         self.keyframes = keyframes;
         self.show_keyframes();
@@ -93,7 +93,7 @@ impl Live {
     /// Whether a limit was reached or cannot be, the devices failed, or they ended and left nothing to train on.
     pub(crate) fn is_over(&self) -> bool {
         if self.is_scoring() {
-            return false; // A mark at the limit is reported.
+            return false; // Scores at the limit are still reported.
         }
         // Where one reached its limit, the others are waited for as long as they can reach theirs.
         let is_done = |session: &Session| session.is_over() || (self.feed.ended() && session.is_idle());
@@ -107,7 +107,7 @@ impl Live {
         self.is_finished() && self.sessions.iter().any(|session| session.steps_missing().is_some_and(|n| n > 0))
     }
 
-    /// Where people look.
+    /// The hub that clients are connected to.
     pub(crate) fn hub(&self) -> Hub {
         self.hub.clone()
     }
@@ -117,7 +117,7 @@ impl Live {
         &self.keyframes
     }
 
-    /// Keyframes that made room for others so far: 0 until the store is full.
+    /// Keyframes evicted so far: 0 until the store is full.
     pub(crate) fn n_evicted(&self) -> u64 {
         self.n_evicted
     }
@@ -127,14 +127,14 @@ impl Live {
         &self.sessions
     }
 
-    /// Takes keyframes, trains, draws and publishes in turn. Where the GPU fails it is opened again.
+    /// Takes keyframes, trains, draws and publishes in turn. If the GPU fails, it is reopened.
     pub(crate) fn advance(&mut self) -> anyhow::Result<()> {
         let advanced =
             self.take_keyframes().and_then(|()| self.step()).and_then(|()| self.render()).and_then(|()| self.publish());
         advanced.or_else(|error| self.recoveries.recover(&mut self.sessions, error))
     }
 
-    /// Waits for what is queued. Where the GPU failed it is opened again; says whether that was needed.
+    /// Waits for queued work. If the GPU failed, it is reopened; returns whether that was necessary.
     pub(crate) fn wait(&mut self) -> anyhow::Result<bool> {
         match self.sessions.iter().try_for_each(Session::wait) {
             Ok(()) => Ok(false),
@@ -142,12 +142,12 @@ impl Live {
         }
     }
 
-    /// What is left on the disk where the run fails now.
+    /// What is saved on disk if the run fails now.
     pub(crate) fn what_is_left(&mut self) -> String {
         recovery::what_is_left(&mut self.sessions)
     }
 
-    /// Gives new keyframes to the model: all that wait in real time, the one that is due in lockstep. None while a mark is scored.
+    /// Pushes new keyframes to the model: all that wait in real time, the one that is due in lockstep. None during an evaluation.
     fn take_keyframes(&mut self) -> anyhow::Result<()> {
         if self.is_scoring() {
             return Ok(());
@@ -190,7 +190,7 @@ impl Live {
         Ok(())
     }
 
-    /// The next keyframe that came or went; none where a picture is asked for that may be drawn now, or nothing happens for
+    /// The next keyframe that was added or removed; `None` if a requested picture may be drawn now, or nothing happens for
     /// [`IDLE`].
     fn wait_for_change(&mut self) -> Option<Change> {
         if self.hub.n_clients() == 0 {
@@ -204,15 +204,15 @@ impl Live {
                 return Some(change);
             }
             let is_asked = self.budget.may_render() && self.hub.wait_for_request(LOOK_EVERY);
-            self.budget.add_training(before.elapsed()); // Training did not want this time.
+            self.budget.add_training(before.elapsed()); // Training had nothing to do in this time.
             if begun.elapsed() >= IDLE || is_asked {
                 return None;
             }
         }
     }
 
-    /// Trains a slice, once there are keyframes enough; scores one test image instead where a mark was reached. Does nothing
-    /// where a picture is asked for that may be drawn at once.
+    /// Trains a slice once there are enough keyframes; during an evaluation, scores one test image instead. Does nothing if a
+    /// requested picture may be drawn at once.
     fn step(&mut self) -> anyhow::Result<()> {
         self.sessions.iter().try_for_each(Session::check_gpu)?;
         if !self.is_training() {
@@ -246,16 +246,16 @@ impl Live {
         Ok(())
     }
 
-    /// Whether a picture is asked for that may be drawn now.
+    /// Whether a picture is requested and may be drawn now.
     fn is_awaited(&self) -> bool {
         self.budget.may_render() && self.hub.wait_for_request(Duration::ZERO)
     }
 
-    /// Draws what people asked for, as far as that leaves training its share of the time.
+    /// Draws requested pictures as long as training keeps its share of the time.
     fn render(&mut self) -> anyhow::Result<()> {
         let begun = Instant::now();
         if !self.is_training() || self.is_idle() {
-            self.budget = RenderBudget::default(); // Nobody else wants the time.
+            self.budget = RenderBudget::default(); // Training does not need the time.
         }
         while begun.elapsed() < MAX_RENDER_TIME && self.budget.may_render() {
             let Some(pending) = self.hub.next_request() else { break };
@@ -269,7 +269,7 @@ impl Live {
                 pending.fail(&format!("no model of the method {asked:?} learns here, but {there}"));
                 continue;
             };
-            // What is queued before the picture is training's time.
+            // Work queued before the picture counts as training time.
             let before = Instant::now();
             session.n_taken()?;
             self.budget.add_training(before.elapsed());
@@ -292,7 +292,7 @@ impl Live {
         let clock_secs = self.sessions[0].secs();
         if self.scoring.as_secs_f64() < SCORE_FRAC * clock_secs && !self.is_scoring() {
             let before = Instant::now();
-            // One image at a time: people wait meanwhile.
+            // One image at a time, because viewers wait meanwhile.
             self.next_refreshed = (self.next_refreshed + 1) % self.sessions.len();
             let session = &mut self.sessions[self.next_refreshed];
             if session.progress().step > 0 {
@@ -318,7 +318,7 @@ impl Live {
 
     /// Ends the input; the sessions and what is left of the input come back.
     pub(crate) fn finish(self) -> (Vec<Session>, anyhow::Result<Leftover>) {
-        // The figures stay: the scores are what people wait for.
+        // The numbers stay, because viewers wait for the scores.
         self.hub.set_state("saving");
         (self.sessions, self.feed.finish())
     }
@@ -373,7 +373,7 @@ impl Live {
                 self.keyframes.push(keyframe.clone());
                 let mut pushed = Ok(());
                 for session in self.sessions.iter_mut().filter(|session| !session.has_all_steps()) {
-                    // Each holds it, also where a GPU failed: it is there when the model is made again.
+                    // Every session holds the keyframe, even after a GPU failure, so that a restored model has it.
                     pushed = pushed.and(session.push(&keyframe));
                 }
                 pushed

@@ -128,11 +128,11 @@ pub(crate) fn load(gpu: Arc<Gpu>, model: &Path) -> anyhow::Result<Box<dyn Method
 pub(crate) struct Loaded {
     pub(crate) kind: Kind,
     pub(crate) method: Box<dyn Method>,
-    /// Where most of it lies; `None` where it is empty or the bounds were not requested.
+    /// Where most of it is; `None` if the model is empty or the bounds were not requested.
     pub(crate) bounds: Option<Bounds>,
 }
 
-/// A saved model as [`load`] reads it, and where most of it lies if `wants_bounds`.
+/// Loads a saved model as [`load`] does; with bounds if `wants_bounds`.
 pub(crate) fn load_with_bounds(gpu: Arc<Gpu>, model: &Path, wants_bounds: bool) -> anyhow::Result<Loaded> {
     expect_model(model)?;
     match kind_in(model)? {

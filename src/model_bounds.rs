@@ -1,17 +1,17 @@
-//! Where most of a saved model lies, for a first view of models whose cameras are unknown.
+//! Bounds of most of a saved model, for the first view of a model without a list of cameras.
 
 use trainer::splat::arrays::SplatArrays;
 use trainer::tsdf::Lattice;
 use trainer::tsdf::block::{BLOCK_EDGE, Place};
 
-/// Share of the points that lie within the radius: stray points and far backgrounds stay outside.
+/// Share of the points inside the radius, so that stray points and far backgrounds stay outside.
 const INSIDE_FRAC: f64 = 0.8;
-/// A model of one point still has some size, in meters.
+/// Minimum radius, meters: even a model of one point needs some size.
 const MIN_RADIUS_M: f64 = 0.01;
-/// With fewer opaque splats than this share, all splats count.
+/// If a smaller share of the splats is opaque, all splats count.
 const MIN_OPAQUE_FRAC: f64 = 0.02;
 
-/// A sphere that holds most of a model.
+/// A sphere that contains most of a model.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Bounds {
     /// In world, meters.
@@ -20,7 +20,7 @@ pub(crate) struct Bounds {
 }
 
 impl Bounds {
-    /// Around the median of the splats that are at least half opaque; `None` without splats.
+    /// Bounds around the median of the splats that are at least half opaque; `None` without splats.
     pub(crate) fn of_splats(splats: &SplatArrays) -> Option<Self> {
         let n_opaque = splats.opacity_logits.iter().filter(|logit| **logit > 0.0).count();
         let takes_all = (n_opaque as f64) < MIN_OPAQUE_FRAC * splats.n_splats() as f64;
@@ -28,7 +28,7 @@ impl Bounds {
         Self::of_points(&kept.map(|(mean, _)| mean.map(f64::from)).collect::<Vec<_>>())
     }
 
-    /// Around the blocks of a distance field; `None` without blocks.
+    /// Bounds around the blocks of a distance field; `None` without blocks.
     pub(crate) fn of_blocks<'a>(blocks: impl Iterator<Item = &'a Place>, lattice: &Lattice) -> Option<Self> {
         let center = |place: &Place| {
             let along = |axis: usize| (f64::from(place[axis]) + 0.5) * f64::from(BLOCK_EDGE) * lattice.voxel_m;
@@ -37,7 +37,7 @@ impl Bounds {
         Self::of_points(&blocks.map(center).collect::<Vec<_>>())
     }
 
-    /// The median along each axis, and the radius that holds [`INSIDE_FRAC`] of the points.
+    /// The median along each axis, and the radius that contains [`INSIDE_FRAC`] of the points.
     fn of_points(points_m: &[[f64; 3]]) -> Option<Self> {
         if points_m.is_empty() {
             return None;
@@ -52,7 +52,7 @@ impl Bounds {
     }
 }
 
-/// The value that a share of all values does not exceed; `values` is not empty.
+/// The value that this fraction of all values does not exceed; `values` is not empty.
 fn quantile(mut values: Vec<f64>, frac: f64) -> f64 {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of a length")]
     let rank = (frac * (values.len() - 1) as f64).round() as usize;
@@ -63,7 +63,7 @@ fn quantile(mut values: Vec<f64>, frac: f64) -> f64 {
 mod tests {
     use super::*;
 
-    /// A cloud of splats: where each is, and how opaque.
+    /// A cloud of splats, given by position and opacity logit.
     fn splats(points: &[([f32; 3], f32)]) -> SplatArrays {
         SplatArrays {
             means: points.iter().map(|(mean, _)| *mean).collect(),

@@ -1,29 +1,29 @@
-//! What to type after a training: commands that work as printed, in the folder in which the training was started.
+//! Commands to run after training; they work as printed, in the folder in which the training was started.
 
 use crate::method::Kind;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// The images that a model was trained on, for commands that need them again.
+/// The images that a model was trained on, for commands that need them.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct DataSource {
-    /// Dataset folder or recording; `None` where a live run was not recorded.
+    /// Dataset folder or recording; `None` if a live run was not recorded.
     pub(crate) path: Option<PathBuf>,
-    /// Flags that `eval` needs to see the same images.
+    /// Flags with which `eval` loads the same images.
     pub(crate) flags: Vec<String>,
     /// Names of the images, by camera and stamp.
     pub(crate) image_names: BTreeMap<(String, i64), String>,
 }
 
 impl DataSource {
-    /// The file name of an image, else its camera and stamp.
+    /// The file name of an image, or without one its camera and stamp.
     pub(crate) fn image_name(&self, camera: &str, stamp_nanos: i64) -> String {
         let known = self.image_names.get(&(camera.to_owned(), stamp_nanos));
         known.cloned().unwrap_or_else(|| format!("{camera}/{stamp_nanos}"))
     }
 }
 
-/// A saved model, as the commands need to know it.
+/// What the commands need to know about a saved model.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct SavedModel<'a> {
     pub(crate) kind: Kind,
@@ -32,7 +32,7 @@ pub(crate) struct SavedModel<'a> {
     pub(crate) n_tests: usize,
 }
 
-/// One command, and what it is for.
+/// A command and its purpose.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct NextCommand {
     pub(crate) purpose: &'static str,
@@ -48,7 +48,7 @@ pub(crate) fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
         commands.push(NextCommand { purpose, command: words.join(" ") });
     };
     if let Some(folder) = common_folder(models) {
-        add("look at it", &["view", &argument(folder)]);
+        add("view the model", &["view", &argument(folder)]);
     }
     for model in models {
         let folder = argument(model.folder);
@@ -61,8 +61,8 @@ pub(crate) fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
             add("score it again", &words);
         }
         let (format, purpose) = match model.kind {
-            Kind::Splat => ("spz", "use it elsewhere"),
-            Kind::Tsdf => ("glb", "use its mesh elsewhere"),
+            Kind::Splat => ("spz", "export the splats"),
+            Kind::Tsdf => ("glb", "export the mesh"),
             Kind::Nerf => continue, // Other programs cannot read it.
         };
         let out = argument(&free_file(&model_name(model.folder), format));
@@ -83,7 +83,7 @@ pub(crate) fn lines(commands: &[NextCommand]) -> Vec<String> {
     commands.iter().map(line).collect()
 }
 
-/// The folder to view: a model's own, or the one in which each of several methods has one.
+/// The folder to view: that of a single model, or the parent folder of several models.
 fn common_folder<'a>(models: &[SavedModel<'a>]) -> Option<&'a Path> {
     match models {
         [] => None,
@@ -92,25 +92,25 @@ fn common_folder<'a>(models: &[SavedModel<'a>]) -> Option<&'a Path> {
     }
 }
 
-/// Name of the files made from a model: that of its folder, which in a run of several methods is the method's.
+/// Base name of files made from a model: that of its folder, which in a run of several methods is the method.
 fn model_name(folder: &Path) -> String {
     folder.file_name().map_or_else(|| "model".to_owned(), |name| name.to_string_lossy().into_owned())
 }
 
-/// A file of this name in the current folder that does not exist yet: `export` refuses to replace one.
+/// A file name in the current folder that does not exist yet, because `export` does not overwrite files.
 fn free_file(name: &str, ending: &str) -> PathBuf {
     let numbered =
         |n: u32| PathBuf::from(if n == 1 { format!("{name}.{ending}") } else { format!("{name}-{n}.{ending}") });
     (1..100).map(numbered).find(|file| !file.exists()).unwrap_or_else(|| numbered(100))
 }
 
-/// A path as a positional argument: one that begins with a hyphen would be taken for a flag.
+/// A path as a positional argument: a leading hyphen would make it a flag.
 fn argument(path: &Path) -> String {
     let text = path.to_string_lossy();
     if text.starts_with('-') { format!("./{text}") } else { text.into_owned() }
 }
 
-/// A word as a shell reads it back.
+/// A word, quoted for a shell.
 pub(crate) fn quoted(word: &str) -> String {
     let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "_-./:=@%+,".contains(letter);
     if !word.is_empty() && word.chars().all(is_plain) {

@@ -1,4 +1,4 @@
-//! A mark whose test images are scored one at a time, so that pictures can be drawn in between.
+//! An evaluation that scores one test image at a time, so that pictures can be drawn in between.
 
 use crate::evaluate::ImageScores;
 use std::collections::VecDeque;
@@ -6,21 +6,21 @@ use std::sync::Arc;
 use std::time::Duration;
 use trainer::Keyframe;
 
-/// Where drawing takes longer, a mark scores fewer test images: a neural field takes seconds for each on a processor.
+/// Time limit for scoring: if drawing is slow, fewer images are scored. A neural field takes seconds per image on a processor.
 const MAX_SCORING: Duration = Duration::from_secs(60);
 
-/// A mark that was reached and is being scored.
+/// An evaluation in progress.
 pub(crate) struct OpenMark {
-    /// Seconds of training at which it was reached.
+    /// Seconds of training when it was due.
     pub(crate) seconds: f64,
-    /// However many of them are scored, they are spread evenly over all.
+    /// Ordered so that the images scored first are already spread evenly over all.
     left: VecDeque<Arc<Keyframe>>,
     images: Vec<ImageScores>,
     spent: Duration,
 }
 
 impl OpenMark {
-    /// A mark reached at `seconds` that scores at most `max_images` of these test keyframes.
+    /// An evaluation due at `seconds` that scores at most `max_images` of these test keyframes.
     pub(crate) fn new<'a>(
         seconds: f64,
         tests: impl ExactSizeIterator<Item = &'a Arc<Keyframe>>,
@@ -33,23 +33,23 @@ impl OpenMark {
         Self { seconds, left, images: Vec::new(), spent: Duration::ZERO }
     }
 
-    /// The next test keyframe to score; `None` where all are scored, or scoring took too long.
+    /// The next test keyframe to score; `None` if all are scored or the time limit is reached.
     pub(crate) fn take_next(&mut self) -> Option<Arc<Keyframe>> {
         if self.spent < MAX_SCORING { self.left.pop_front() } else { None }
     }
 
-    /// Adds what scoring the last keyframe found and how long it took.
+    /// Adds the scores of the last keyframe and the time that scoring took.
     pub(crate) fn add(&mut self, scores: ImageScores, spent: Duration) {
         self.images.push(scores);
         self.spent += spent;
     }
 
-    /// Whether there is nothing left to score.
+    /// Whether no image is left to score.
     pub(crate) fn is_complete(&self) -> bool {
         self.left.is_empty() || self.spent >= MAX_SCORING
     }
 
-    /// The scores found.
+    /// The scores so far.
     pub(crate) fn into_images(self) -> Vec<ImageScores> {
         self.images
     }

@@ -1,6 +1,6 @@
-//! Files and folders under way: whole in the end, or not there.
+//! Files and folders that are being written: complete in the end, or removed.
 //!
-//! A [`Partial`] removes what it names unless it is kept, after an error and after a signal alike.
+//! A [`Partial`] removes its files unless they are kept, both after an error and after a signal.
 
 use crate::stop;
 use anyhow::Context;
@@ -9,23 +9,23 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// What is under way in this process.
+/// The files and folders that this process is writing.
 static UNDER_WAY: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
-/// Shells report a process ended by a signal as this plus the signal's number.
+/// For a process ended by a signal, shells report this plus the signal number.
 const ENDED_BY_SIGNAL: i32 = 128;
 
-/// Files or folders being written; removed on drop unless they were kept.
+/// Files or folders being written; removed on drop unless they are kept.
 #[derive(Debug)]
-#[must_use = "dropped, it removes what it names"]
+#[must_use = "dropping it removes its files"]
 pub(crate) struct Partial(Vec<PathBuf>);
 
 impl Partial {
-    /// A file that is about to be written, under its own name or, until it is whole, with `.part` after it.
+    /// A file that will be written, under its own name or, until it is complete, with the suffix `.part`.
     pub(crate) fn file(path: &Path) -> Self {
         Self::begin(vec![path.to_owned(), trainer::whole_file::partial_path(path)])
     }
 
-    /// A folder that is about to be filled with these entries: all of it where it does not exist yet.
+    /// A folder that will be filled with these entries; the folder itself, if it does not exist yet.
     pub(crate) fn folder(path: &Path, entries: &[&str]) -> Self {
         if path.exists() {
             return Self::begin(entries.iter().map(|entry| path.join(entry)).collect());
@@ -33,14 +33,14 @@ impl Partial {
         Self::begin(vec![path.to_owned()])
     }
 
-    /// What exists already is somebody else's, and stays.
+    /// Files that already exist belong to someone else and are not removed.
     fn begin(paths: Vec<PathBuf>) -> Self {
         let paths: Vec<PathBuf> = paths.into_iter().filter(|path| !path.exists()).collect();
         under_way().extend(paths.iter().cloned());
         Self(paths)
     }
 
-    /// Keeps what was written: it is whole.
+    /// Keeps the files, because they are complete.
     pub(crate) fn keep(mut self) {
         let paths = std::mem::take(&mut self.0);
         under_way().retain(|path| !paths.contains(path));
@@ -57,14 +57,14 @@ impl Drop for Partial {
     }
 }
 
-/// Makes the signals that ask for an end remove what is under way before they end the process.
+/// Makes the signals that end a process remove partial files first.
 ///
 /// For commands that have nothing to save when they are cancelled; others use [`crate::stop::Stop`].
 pub(crate) fn remove_on_signals() -> anyhow::Result<()> {
-    let mut signals = Signals::new(stop::ending_signals()).context("cannot listen to signals")?;
+    let mut signals = Signals::new(stop::ending_signals()).context("cannot install signal handlers")?;
     let remove_all = move || {
         if let Some(signal) = signals.forever().next() {
-            // Held to the end, so that nothing begins meanwhile.
+            // Locked until the process exits, so that no new file is started.
             let under_way = under_way();
             under_way.iter().for_each(|path| remove(path));
             std::process::exit(ENDED_BY_SIGNAL + signal);
@@ -82,7 +82,7 @@ fn remove(path: &Path) {
     let removed = if path.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
     match removed {
         Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-            log::warn!("cannot remove {}, which is not whole: {error}", path.display());
+            log::warn!("cannot remove the incomplete {}: {error}", path.display());
         }
         _ => {}
     }

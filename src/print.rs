@@ -1,9 +1,9 @@
 //! What people and programs see: results on stdout, log and progress on stderr.
 //!
-//! A command whose result is its output (`devices`, `metrics`) prints with [`line()`] and [`json`], which fail when stdout does.
+//! A command whose result is its output (`devices`, `metrics`) prints with [`line()`] and [`json`], which fail if stdout fails.
 //! A command whose result is a file (`train`, `run`, `record`) prints with [`report`] and [`report_json`], which never fail: a
-//! closed terminal or a full disk costs the lines, not the model. A thread of its own writes them, so that a terminal that takes no
-//! output holds up nothing. [`lost_output`] says afterwards whether any lines were lost.
+//! closed terminal or a full disk loses lines, not the model. A separate thread writes the lines, so that a terminal that accepts
+//! no output does not block the program. [`lost_output`] returns afterwards whether any lines were lost.
 
 use anyhow::Context;
 use console::Term;
@@ -26,21 +26,21 @@ static BARS: LazyLock<MultiProgress> = LazyLock::new(|| MultiProgress::with_draw
 /// Whether a line of [`report`] could not be written.
 static LOST_OUTPUT: AtomicBool = AtomicBool::new(false);
 
-/// Pieces of output that may wait to be written: a terminal that takes none, such as one behind a broken connection, holds up
-/// nobody until there are more.
+/// Maximum number of pieces of output that wait to be written. Up to this many, a terminal that accepts no output, such as one
+/// behind a broken connection, does not block the program.
 const MAX_WAITING: usize = 4096;
-/// A program that ends waits this long for its output to be taken.
+/// At exit, the program waits at most this long for its output to be written.
 const MAX_FLUSH: Duration = Duration::from_secs(5);
 
-/// A piece of output on its way to a stream.
+/// A piece of output for a stream.
 enum Piece {
     Out(Vec<u8>),
     Err(Vec<u8>),
-    /// Answered when everything before it was written.
+    /// Answered when everything before it has been written.
     Flush(SyncSender<()>),
 }
 
-/// Takes output to the thread that writes it.
+/// Sends output to the thread that writes it.
 static WRITER: LazyLock<SyncSender<Piece>> = LazyLock::new(|| {
     let (sender, pieces) = sync_channel(MAX_WAITING);
     std::thread::spawn(move || pieces.into_iter().for_each(write));
@@ -55,7 +55,7 @@ fn write(piece: Piece) {
                 note_lost(&error.to_string());
             }
         }
-        // Lost with its terminal, or on a full disk.
+        // Lost if the terminal is closed or the disk is full.
         Piece::Err(bytes) => drop(std::io::stderr().write_all(&bytes)),
         Piece::Flush(done) => drop(done.send(())),
     }
@@ -63,11 +63,11 @@ fn write(piece: Piece) {
 
 fn note_lost(why: &str) {
     if !LOST_OUTPUT.swap(true, Ordering::Relaxed) {
-        log::warn!("cannot write to stdout ({why}): output is lost, the work continues");
+        log::warn!("cannot write to stdout ({why}): output is lost, but the command continues");
     }
 }
 
-/// Waits until output is written, for a moment where nobody takes it.
+/// Waits until all output is written, but not for long if the stream accepts none.
 pub(crate) fn flush() {
     let (done, is_done) = sync_channel(1);
     let is_written = WRITER.try_send(Piece::Flush(done)).is_ok() && is_done.recv_timeout(MAX_FLUSH).is_ok();
@@ -76,7 +76,7 @@ pub(crate) fn flush() {
     }
 }
 
-/// Where bars are drawn: on stderr where that is a terminal.
+/// Where progress bars are drawn: stderr, if that is a terminal.
 fn target() -> ProgressDrawTarget {
     let term = Term::stderr();
     if term.is_term() {
@@ -86,14 +86,14 @@ fn target() -> ProgressDrawTarget {
     }
 }
 
-/// A terminal that may disappear, or stop taking output, at any time: what is drawn goes to the thread that writes.
+/// A terminal that may disappear or stop accepting output at any time: output goes through the writing thread.
 ///
-/// indicatif's own target waits for the terminal, and panics when drawing fails (`MultiProgress::suspend`), as it does with EIO
-/// once a terminal is closed.
+/// indicatif's own target blocks on the terminal, and panics if drawing fails (`MultiProgress::suspend`), as it does with EIO
+/// after a terminal is closed.
 #[derive(Debug)]
 struct BarTerm {
     term: Term,
-    /// Since the last flush.
+    /// Drawn since the last flush.
     drawn: Mutex<String>,
 }
 
@@ -148,7 +148,7 @@ impl TermLike for BarTerm {
     fn flush(&self) -> std::io::Result<()> {
         let drawn = std::mem::take(&mut *self.drawn.lock().unwrap_or_else(PoisonError::into_inner));
         if !drawn.is_empty() {
-            let _ = WRITER.try_send(Piece::Err(drawn.into_bytes())); // A bar nobody looks at is drawn again later.
+            let _ = WRITER.try_send(Piece::Err(drawn.into_bytes())); // If the bar is lost, it is drawn again later.
         }
         Ok(())
     }
@@ -163,21 +163,21 @@ pub(crate) fn line(text: impl Display) -> Result<(), StdoutError> {
     })
 }
 
-/// Prints one line about a result that lies elsewhere. Where stdout fails or takes nothing the line is lost, which is logged once.
+/// Prints one line about a result in a file. If stdout fails or accepts no output, the line is lost, which is logged once.
 pub(crate) fn report(text: impl Display) {
     let sent = BARS.suspend(|| WRITER.try_send(Piece::Out(format!("{text}\n").into_bytes())));
     if sent.is_err() {
-        note_lost("it takes no more");
+        note_lost("it accepts no more output");
     }
 }
 
-/// Prints the error that ends the program on stderr, as the log is: a terminal that takes no output does not keep the program from
-/// ending, and the exit code remains.
+/// Prints the error that ends the program to stderr, through the writer thread like the log: a terminal that takes no output cannot keep
+/// the program from ending, and the exit code remains.
 pub(crate) fn error(error: &anyhow::Error) {
     let _ = BARS.suspend(|| WRITER.try_send(Piece::Err(format!("error: {error:#}\n").into_bytes())));
 }
 
-/// Whether a line of [`report`] was lost.
+/// Whether any line of [`report`] was lost.
 pub(crate) fn lost_output() -> bool {
     LOST_OUTPUT.load(Ordering::Relaxed)
 }
@@ -196,10 +196,10 @@ pub(crate) fn json(value: &impl Serialize) -> anyhow::Result<()> {
     Ok(line(json_text(value)?)?)
 }
 
-/// Prints one JSON object on a line of its own, as [`report`] does.
+/// Prints one JSON object on a separate line, as [`report`] does.
 ///
 /// # Errors
-/// If the value has no JSON form.
+/// If the value cannot be written as JSON.
 pub(crate) fn report_json(value: &impl Serialize) -> anyhow::Result<()> {
     report(json_text(value)?);
     Ok(())
@@ -235,7 +235,7 @@ pub(crate) fn start_log(verbose: u8) {
         .init();
 }
 
-/// Stderr, with the bars moved out of the way. Records that cannot be written are lost, never an error of whoever logged.
+/// Stderr, with the bars moved out of the way. Records that cannot be written are lost without an error to the caller.
 struct AboveBars;
 
 impl Write for AboveBars {

@@ -1,4 +1,4 @@
-//! A GPU that fails during a run: every model continues on a newly opened device from its newest checkpoint.
+//! Recovery from a GPU failure during a run: every model continues on a reopened device from its newest checkpoint.
 
 use crate::commands;
 use crate::decisions::Settings;
@@ -13,11 +13,11 @@ use std::time::{Duration, Instant};
 use trainer::Keyframe;
 use trainer::gpu::Gpu;
 
-/// How often a run opens the GPU again.
+/// How many times a run tries to reopen the GPU.
 const MAX_RECOVERIES: u32 = 3;
-/// A run that lasts for days may fail now and then: after this time without a failure the count begins again.
+/// After this time without a failure the count starts again: a run that lasts for days may fail now and then.
 const FORGOTTEN_AFTER: Duration = Duration::from_secs(600);
-/// A driver that resets needs a moment.
+/// Pause between attempts: a driver reset takes a moment.
 const BEFORE_RETRY: Duration = Duration::from_secs(1);
 
 /// What a session needs to continue on another device.
@@ -25,18 +25,18 @@ pub(crate) struct Recovery {
     pub(crate) recipe: Recipe,
     /// Folder of the run.
     pub(crate) folder: PathBuf,
-    /// Folder of the checkpoint that the run continues from, where it is a resumed one.
+    /// Folder of the checkpoint that the run was resumed from, if it was.
     pub(crate) resumed: Option<PathBuf>,
-    /// Keyframes that the resumed model had learned from.
+    /// Keyframes that the resumed model was trained on.
     pub(crate) known: Vec<Arc<Keyframe>>,
-    /// Of the log of decisions.
+    /// Settings for the log of decisions.
     pub(crate) settings: Settings,
-    /// What to type to continue from the newest checkpoint.
+    /// The command that continues from the newest checkpoint.
     pub(crate) resume_command: String,
 }
 
 impl Recovery {
-    /// What is left of a run whose model could not be saved, as a sentence without a period.
+    /// What can be continued if the model cannot be saved, as a sentence without a period.
     pub(crate) fn what_is_left(&self, has_checkpoint: bool) -> String {
         let Self { folder, resume_command, .. } = self;
         match (has_checkpoint, &self.resumed) {
@@ -44,10 +44,7 @@ impl Recovery {
                 format!("the newest checkpoint is {}: `{resume_command}` continues from it", in_folder(folder))
             }
             (false, Some(resumed)) => {
-                format!(
-                    "no checkpoint was written since that of {}, from which it can be resumed again",
-                    resumed.display()
-                )
+                format!("no newer checkpoint was written: resume again from the one in {}", resumed.display())
             }
             (false, None) => "no checkpoint was written yet: start the run again".to_owned(),
         }
@@ -58,17 +55,17 @@ fn in_folder(folder: &Path) -> String {
     folder.join(CHECKPOINT).display().to_string()
 }
 
-/// The GPU failed and a run could not continue on another device; says what is left on the disk.
+/// The GPU failed and the run could not continue on another device; the text names what is saved on disk.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub(crate) struct GpuGone(String);
 
-/// Whether it is the GPU that failed.
+/// Whether the GPU caused the error.
 pub(crate) fn is_of_gpu(error: &anyhow::Error) -> bool {
     error.chain().any(|cause| cause.downcast_ref().is_some_and(trainer::Error::is_of_gpu))
 }
 
-/// What is left of these sessions on the disk, where they fail now: a sentence without a period; empty where nothing is known.
+/// What is saved of these sessions if they fail now: a sentence without a period, or empty if nothing is known.
 pub(crate) fn what_is_left(sessions: &mut [Session]) -> String {
     let left = sessions.iter_mut().filter_map(|session| {
         let has_checkpoint = session.has_checkpoint();
@@ -77,7 +74,7 @@ pub(crate) fn what_is_left(sessions: &mut [Session]) -> String {
     left.collect::<Vec<_>>().join("; ")
 }
 
-/// An error of the GPU with what is left on the disk.
+/// Adds what is saved on disk to an error of the GPU.
 pub(crate) fn with_what_is_left(error: anyhow::Error, left: &str) -> anyhow::Error {
     if is_of_gpu(&error) && !left.is_empty() {
         error.context(format!("the GPU failed at the end of the run; {left}"))
@@ -86,7 +83,7 @@ pub(crate) fn with_what_is_left(error: anyhow::Error, left: &str) -> anyhow::Err
     }
 }
 
-/// How often the GPU of a run was opened again.
+/// Counts the attempts of a run to reopen the GPU.
 #[derive(Debug, Default)]
 pub(crate) struct Recoveries {
     n: u32,
@@ -94,8 +91,8 @@ pub(crate) struct Recoveries {
 }
 
 impl Recoveries {
-    /// Continues all sessions on a newly opened device where the error is one of the GPU; else gives the error back, as it does where
-    /// that is in vain.
+    /// Continues all sessions on a reopened device if the GPU caused the error. Otherwise, and if all attempts fail, returns the
+    /// error.
     pub(crate) fn recover(&mut self, sessions: &mut [Session], error: anyhow::Error) -> anyhow::Result<()> {
         if !is_of_gpu(&error) || sessions.iter().any(|session| session.recovery().is_none()) {
             return Err(error);
@@ -110,7 +107,7 @@ impl Recoveries {
                 std::thread::sleep(BEFORE_RETRY);
             }
             self.n += 1;
-            log::warn!("{error:#}: opening the GPU again, attempt {} of {MAX_RECOVERIES}", self.n);
+            log::warn!("{error:#}: reopening the GPU, attempt {} of {MAX_RECOVERIES}", self.n);
             match restart_all(sessions) {
                 Ok(()) => {
                     // Several sessions share one clock.
@@ -122,17 +119,17 @@ impl Recoveries {
             }
         }
         let left = what_is_left(sessions);
-        Err(GpuGone(format!("{error:#}; gave up after opening the GPU again {MAX_RECOVERIES} times; {left}")).into())
+        Err(GpuGone(format!("{error:#}; giving up after {MAX_RECOVERIES} attempts to reopen the GPU; {left}")).into())
     }
 }
 
 fn restart_all(sessions: &mut [Session]) -> anyhow::Result<()> {
-    sessions.iter_mut().for_each(Session::drop_model); // Its memory may be needed.
-    let gpu = commands::open_gpu().context("the GPU cannot be opened again")?;
+    sessions.iter_mut().for_each(Session::drop_model); // The new model may need its memory.
+    let gpu = commands::open_gpu().context("cannot reopen the GPU")?;
     sessions.iter_mut().try_for_each(|session| session.restart_on(&gpu))
 }
 
-/// Keeps quiet about a panic of wgpu that is caught: where it finds out while it waits that a driver lost its device, it panics.
+/// Hides the message of a panic that is caught: wgpu panics if it notices a lost device while it waits.
 pub(crate) fn hide_caught_panics() {
     static IS_SET: Once = Once::new();
     IS_SET.call_once(|| {
@@ -155,7 +152,7 @@ pub(crate) fn lose_for_tests(gpu: &Gpu, step: u64) {
     }
 }
 
-/// For tests: with `FIELDRIG_TEST_OPEN_GPU_ONCE` set no GPU is found after the first was opened.
+/// For tests: with `FIELDRIG_TEST_OPEN_GPU_ONCE` set, the GPU can be opened only once.
 pub(crate) fn check_open_for_tests() -> Result<(), trainer::Error> {
     static IS_OPENED: AtomicBool = AtomicBool::new(false);
     let was_opened = IS_OPENED.swap(true, Ordering::Relaxed);

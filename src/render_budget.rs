@@ -1,19 +1,19 @@
-//! How much of the time may go into pictures while models learn.
+//! Limits the share of time that pictures take from training.
 //!
-//! Training saves time up, pictures spend it, one for one: a picture is drawn at once while there is something left, and training keeps at
-//! least half of the time however many pictures are asked for.
+//! Time spent on training is credited to pictures one for one. A picture is drawn at once while credit is left, so training
+//! keeps at least half of the time however many pictures are requested.
 
 use std::time::Duration;
 
-/// What training saves up at most, seconds, or as much as its last slice took: so long a burst of pictures is drawn at once.
+/// Maximum credit, seconds; more if the last slice of training took longer. It allows a burst of pictures of this length.
 const MAX_SAVED_SECS: f64 = 0.1;
-/// What pictures owe at most, seconds: after one that takes longer, training catches up on this much.
+/// Maximum debt, seconds: after a picture that takes longer, training catches up on this much only.
 const MAX_OWED_SECS: f64 = 1.0;
 
-/// The time that is left for pictures.
+/// The time available for pictures.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct RenderBudget {
-    /// Saved if positive, owed if negative.
+    /// Credit if positive, debt if negative.
     balance_secs: f64,
 }
 
@@ -29,13 +29,13 @@ impl RenderBudget {
         self.balance_secs >= 0.0
     }
 
-    /// Adds time that went into training.
+    /// Adds time spent on training.
     pub(crate) fn add_training(&mut self, spent: Duration) {
         let spent_secs = spent.as_secs_f64();
         self.balance_secs = (self.balance_secs + spent_secs).min(MAX_SAVED_SECS.max(spent_secs));
     }
 
-    /// Takes off time that went into a picture.
+    /// Subtracts time spent on a picture.
     pub(crate) fn add_render(&mut self, spent: Duration) {
         self.balance_secs = (self.balance_secs - spent.as_secs_f64()).max(-MAX_OWED_SECS);
     }
@@ -47,7 +47,7 @@ mod tests {
 
     const STEP: Duration = Duration::from_millis(4);
 
-    /// Shares of the time that pictures and training get, where pictures are asked for without end.
+    /// Fraction of the time that pictures get if they are requested back to back.
     fn render_frac(picture: Duration, step: Duration) -> f64 {
         let (mut budget, mut rendered, mut trained) = (RenderBudget::default(), Duration::ZERO, Duration::ZERO);
         for _ in 0..10_000 {
@@ -65,9 +65,9 @@ mod tests {
     fn training_keeps_half_of_the_time_whatever_pictures_take() {
         for millis in [1, 3, 40, 400] {
             let frac = render_frac(Duration::from_millis(millis), STEP);
-            assert!((0.49..0.51).contains(&frac), "{millis} ms a picture: {frac}");
+            assert!((0.49..0.51).contains(&frac), "{millis} ms per picture: {frac}");
         }
-        // A picture on a processor may take longer than anybody waits for the next one.
+        // On a processor a picture may take so long that its debt is capped.
         assert!(render_frac(Duration::from_secs(10), STEP) > 0.8);
     }
 
@@ -82,7 +82,7 @@ mod tests {
         assert_eq!(n_drawn, 34);
         budget.add_training(STEP);
         assert!(budget.may_render());
-        // On a processor a step takes seconds: all stages of a picture are drawn between two of them.
+        // On a processor a step takes seconds, so all stages of a picture are drawn between two steps.
         budget.add_training(Duration::from_secs(2));
         for stage_millis in [100, 500, 1300] {
             assert!(budget.may_render());

@@ -46,7 +46,7 @@ pub(crate) fn refuse_data(out: &Path, data: &Path) -> Result<(), BadArgument> {
     let whole = |path: &Path| path.canonicalize().ok();
     match (whole(out), whole(data)) {
         (Some(folder), Some(data)) if folder == data => {
-            Err(BadArgument(format!("--out {}: this is the folder of the data, name another one", out.display())))
+            Err(BadArgument(format!("--out {}: this is the folder of the data, name another folder", out.display())))
         }
         _ => Ok(()),
     }
@@ -88,8 +88,8 @@ pub(crate) fn expect_model(model: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The models at a path: itself, or those in the folder of a run of several methods. Refuses what [`expect_model`] refuses;
-/// of several methods those without a model are left out, unless none has one.
+/// The models at a path: the path itself, or the models in the folder of a run of several methods. Refuses the same paths as
+/// [`expect_model`]. Methods without a model are left out, unless none has one.
 pub(crate) fn models_at(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let holds_model = |folder: &Path| MODEL_FILES.iter().any(|name| folder.join(name).exists());
     let inside = Kind::ALL.into_iter().map(|kind| path.join(kind.name())).filter(|folder| holds_model(folder));
@@ -203,12 +203,12 @@ fn make(asked: Option<&Path>) -> anyhow::Result<PathBuf> {
     make_in(Path::new(RUNS), "")
 }
 
-/// Makes a folder for a model that the folder of its run refuses, among the temporary files.
+/// Makes a folder in the system's folder for temporary files, for a model that cannot be saved in the folder of its run.
 pub(crate) fn make_rescue() -> anyhow::Result<PathBuf> {
     make_in(&std::env::temp_dir(), "fieldrig-")
 }
 
-/// Makes a new folder by the name of the time.
+/// Makes a new folder named after the current time.
 fn make_in(parent: &Path, prefix: &str) -> anyhow::Result<PathBuf> {
     #[expect(clippy::disallowed_methods, reason = "a name for people; nothing is measured by it")]
     let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
@@ -228,7 +228,7 @@ fn make_in(parent: &Path, prefix: &str) -> anyhow::Result<PathBuf> {
             Err(error) => return Err(error).with_context(|| format!("cannot make the folder {}", folder.display())),
         }
     }
-    bail!("{} and ninety-eight more exist already: name a folder with --out", parent.join(name).display())
+    bail!("{} and 98 numbered variants already exist: name a folder with --out", parent.join(name).display())
 }
 
 /// Keeps other runs out of a folder as long as this process lives.
@@ -254,7 +254,7 @@ pub(crate) fn save_model(method: &mut dyn Method, folder: &Path) -> anyhow::Resu
         std::fs::remove_dir_all(&unfinished).with_context(|| format!("cannot remove {}", unfinished.display()))?;
     }
     if let Err(error) = method.save(&unfinished) {
-        let _ = std::fs::remove_dir_all(&unfinished); // What it holds is of no use, and takes room.
+        let _ = std::fs::remove_dir_all(&unfinished); // Incomplete, and it takes space.
         return Err(error.into());
     }
     // Splats and blocks come last: a folder that holds them holds the whole model.

@@ -1,4 +1,4 @@
-//! Where an orbiting view starts: around the point the cameras look at, else around the model.
+//! The first view: around the point that the cameras look at, or without cameras around the model.
 
 use crate::model_bounds::Bounds;
 use kinematics::Transform;
@@ -12,9 +12,9 @@ const BELIEVED_AHEAD_M: f64 = 0.5;
 /// Weight of that belief against one camera's axis: it decides only along directions that no axis decides.
 const BELIEF: f64 = 0.01;
 
-/// Distance of a view from outside, in radii of the model: most of it fits into a view of 50 degrees.
+/// Distance of a view from outside, in radii of the model: most of the model fits into a view of 50 degrees.
 const DISTANCE_RADII: f64 = 2.0;
-/// Direction from the model to a view from outside: from the front right, 30 degrees above the horizon.
+/// Direction from the model to an outside view: from the front right, 30 degrees above the horizon.
 const TOWARDS_VIEW: [f64; 3] = [0.5, -0.707, 0.5];
 
 /// The point nearest to all optical axes, from the first camera; `None` without keyframes.

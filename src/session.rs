@@ -90,7 +90,7 @@ pub(crate) struct Session {
     decisions: Option<DecisionLog>,
     data: DataSource,
     recovery: Option<Recovery>,
-    /// Evicted keyframes without their pixels, which the newest checkpoint may know; those before the last one come first.
+    /// Evicted keyframes without their pixels, which the newest checkpoint may contain. The first were evicted before the last checkpoint.
     evicted: Vec<Arc<Keyframe>>,
     n_evicted_before_last: usize,
     gpu: Arc<Gpu>,
@@ -109,9 +109,9 @@ pub(crate) struct Session {
     /// When it was done though others were not, seconds.
     rested_secs: Option<f64>,
     marks: Marks,
-    /// Reached and not scored yet.
+    /// Due and not completely scored yet.
     open_mark: Option<OpenMark>,
-    /// Whether the caller scores an open mark image by image.
+    /// Whether the caller scores an open evaluation image by image.
     scores_stepwise: bool,
     told: Vec<Eval>,
     history: Vec<(f64, f64)>,
@@ -198,7 +198,7 @@ struct NamedScores<'a> {
     scores: &'a ImageScores,
 }
 
-/// A trained model after it was saved and scored, still in GPU memory.
+/// A trained model that is saved and scored, still in GPU memory.
 pub(crate) struct Finished {
     pub(crate) kind: Kind,
     pub(crate) method: Box<dyn Method>,
@@ -225,14 +225,14 @@ pub(crate) struct Ending<P> {
     pub(crate) particulars: P,
 }
 
-/// Saves the models; then scores each a last time, writes its report, and tells the end. The models come back, to be shown.
+/// Saves the models, then scores each a last time, writes its report, and reports the end. Returns the models so that they can be shown.
 pub(crate) fn finish(mut endings: Vec<Ending<impl Serialize>>) -> anyhow::Result<Vec<Finished>> {
     // Saved before any is scored: a second Ctrl-C during the scoring loses nothing.
     let ended_secs: Vec<f64> = endings.iter_mut().map(|ending| ending.session.halt()).collect::<anyhow::Result<_>>()?;
     let mut saved = Vec::new();
     let mut failed = Ok(());
     for (mut ending, seconds) in endings.into_iter().zip(ended_secs) {
-        // One model that cannot be saved does not cost the others.
+        // If one model cannot be saved, the others still are.
         match ending.session.save(&ending.out, seconds) {
             Ok(Saved { folder, sha256, failed: error }) => {
                 ending.out = folder;
@@ -265,7 +265,7 @@ pub(crate) fn finish(mut endings: Vec<Ending<impl Serialize>>) -> anyhow::Result
     failed.map(|()| finished)
 }
 
-/// A model on the disk.
+/// A model on disk.
 struct Saved {
     folder: PathBuf,
     sha256: String,
@@ -326,8 +326,8 @@ impl Session {
         Self { stop: stop.clone(), ..self }
     }
 
-    /// Leaves the scoring of marks to [`Self::score_next`]: the caller draws pictures in between, and neither trains nor pushes
-    /// keyframes while [`Self::is_scoring`], so that all images of a mark are scored on one state of the model.
+    /// Leaves scoring to [`Self::score_next`]: the caller draws pictures in between, and neither trains nor pushes keyframes
+    /// while [`Self::is_scoring`], so that all images of an evaluation are scored on one state of the model.
     pub(crate) fn with_stepwise_scoring(self) -> Self {
         Self { scores_stepwise: true, ..self }
     }
@@ -342,12 +342,12 @@ impl Session {
         Self { decisions: Some(decisions), ..self }
     }
 
-    /// Names the data in the report and in the commands to type next.
+    /// Names the data in the report and in the commands to run next.
     pub(crate) fn with_data(self, data: DataSource) -> Self {
         Self { data, ..self }
     }
 
-    /// Continues on another device where the GPU fails.
+    /// Continues on another device if the GPU fails.
     pub(crate) fn with_recovery(self, recovery: Recovery) -> Self {
         Self { recovery: Some(recovery), ..self }
     }
@@ -399,7 +399,7 @@ impl Session {
         Ok(())
     }
 
-    /// Holds a keyframe that the model has learned from before, in the run that is resumed.
+    /// Holds a keyframe that the model was already trained on in the resumed run.
     pub(crate) fn hold(&mut self, keyframe: &Arc<Keyframe>) {
         if keyframe.split == Split::Test {
             if keyframe.rgba_srgb.chunks_exact(4).any(|pixel| pixel[3] > 0) {
@@ -484,17 +484,17 @@ impl Session {
         Ok(n)
     }
 
-    /// An error where the GPU failed.
+    /// Returns an error if the GPU failed.
     pub(crate) fn check_gpu(&self) -> anyhow::Result<()> {
         Ok(self.gpu.check()?)
     }
 
-    /// Waits for what is queued.
+    /// Waits for queued work.
     pub(crate) fn wait(&self) -> anyhow::Result<()> {
         Ok(self.gpu.wait()?)
     }
 
-    /// What it needs to continue on another device.
+    /// What is needed to continue on another device, if anything is.
     pub(crate) fn recovery(&self) -> Option<&Recovery> {
         self.recovery.as_ref()
     }
@@ -504,17 +504,17 @@ impl Session {
         self.checkpoints.as_mut().is_some_and(|checkpoints| checkpoints.newest().is_some())
     }
 
-    /// Leaves this much out of the time of training.
+    /// Excludes this much from the training time.
     pub(crate) fn exclude(&self, spent: Duration) {
         self.clock.exclude(spent);
     }
 
-    /// Lets go of a model on a device that failed; [`Self::restart_on`] makes it again.
+    /// Drops the model on a failed device; [`Self::restart_on`] makes a new one.
     pub(crate) fn drop_model(&mut self) {
         self.method = Box::new(Absent);
     }
 
-    /// Makes the model again on another device: from the newest checkpoint, or afresh where there is none.
+    /// Restores the model on another device, from the newest checkpoint or, without one, from the start.
     pub(crate) fn restart_on(&mut self, gpu: &Arc<Gpu>) -> anyhow::Result<()> {
         let Some(recovery) = &self.recovery else { anyhow::bail!("this run cannot continue on another device") };
         let written = self.checkpoints.as_mut().and_then(Checkpoints::newest).map(Path::to_owned);
@@ -530,7 +530,7 @@ impl Session {
             if recovery::is_of_gpu(&error) {
                 return Err(error);
             }
-            log::warn!("the newest checkpoint is of no use: {error:#}");
+            log::warn!("cannot resume from the newest checkpoint: {error:#}");
             Ok(None)
         })?;
         let is_resumed = resumed.is_some();
@@ -545,7 +545,7 @@ impl Session {
             method.remove(&keyframe.camera, keyframe.stamp)?;
         }
         let from_step = method.n_taken()?;
-        // The log so far is that of a run that ended here; what follows is a log of its own, perhaps in the same file.
+        // The log so far is that of a run that ended here; a new log begins, perhaps in the same file.
         if let Some(decisions) = self.decisions.take() {
             decisions.break_off();
         }
@@ -557,7 +557,7 @@ impl Session {
             decisions.pushed(method.n_taken()?, keyframe);
         }
         log::info!(
-            "the GPU is back: training continues from {}",
+            "reopened the GPU: training continues from {}",
             if is_resumed { format!("the checkpoint of step {from_step}") } else { "the start".to_owned() }
         );
         (self.method, self.gpu, self.decisions) = (method, gpu.clone(), Some(decisions));
@@ -568,7 +568,7 @@ impl Session {
 
     /// Trains for a turn on a device that others use too, at most `n_most` steps; what was queued is done at its end.
     ///
-    /// `is_awaited`: whether somebody waits for the turn's end; asked after each submit.
+    /// `is_awaited`: whether a picture waits for the end of the turn; asked after each submit.
     pub(crate) fn take_turn(
         &mut self,
         n_most: impl Fn(&Self) -> u64,
@@ -626,7 +626,7 @@ impl Session {
             if let Some(decisions) = &mut self.decisions {
                 decisions.checkpoint(self.method.n_taken()?);
             }
-            // Until this one is written the one before is the newest, and that knows no keyframe that was evicted before it.
+            // Until this checkpoint is written, the previous one is the newest, and it contains no keyframe evicted before it.
             self.evicted.drain(..self.n_evicted_before_last);
             self.n_evicted_before_last = self.evicted.len();
         }
@@ -640,12 +640,12 @@ impl Session {
         Ok(())
     }
 
-    /// Whether a mark was reached whose test images are not all scored.
+    /// Whether an evaluation is in progress.
     pub(crate) fn is_scoring(&self) -> bool {
         self.open_mark.is_some()
     }
 
-    /// Scores one more test image of the open mark, and reports the mark after its last one.
+    /// Scores one more test image of the open evaluation, and reports the evaluation after its last image.
     pub(crate) fn score_next(&mut self) -> anyhow::Result<()> {
         let Some(mut mark) = self.open_mark.take() else { return Ok(()) };
         if self.stop.asked() {
@@ -664,7 +664,7 @@ impl Session {
         Ok(())
     }
 
-    /// Sets whether pictures are asked for while it learns: submits are shorter then.
+    /// Sets whether pictures are requested during training; submits are shorter then.
     pub(crate) fn set_watched(&mut self, watched: bool) {
         self.method.set_watched(watched);
     }
@@ -702,7 +702,7 @@ impl Session {
         self.method.progress()
     }
 
-    /// Saves the model after so many seconds of training; where its folder takes no more, in a folder for temporary files.
+    /// Saves the model after this many seconds of training; if its folder cannot be written, in a folder for temporary files.
     fn save(&mut self, out: &Path, seconds: f64) -> anyhow::Result<Saved> {
         if let Some(decisions) = self.decisions.take()
             && let Err(error) = decisions.end(self.method.n_taken()?)
@@ -712,8 +712,8 @@ impl Session {
         if self.method.progress().primitives == 0 {
             log::warn!("the model is empty: nothing that was seen could be used");
         }
-        // Saving ends a trial that is under way; the checkpoint is of the state before it, so that a resumed run ends it when it is due.
-        // A live run is over at its limit only: to a model that waits for keyframes more may come.
+        // Saving ends a trial in progress. The checkpoint holds the state before that, so that a resumed run ends the trial when it is due.
+        // A live run without new keyframes is not finished: more may come after it is resumed.
         let is_live = self.checkpoints.as_ref().is_some_and(Checkpoints::keeps_keyframes);
         let is_finished = self.is_over() || (self.is_idle() && !is_live);
         let (method, keyframes) = (self.method.as_mut(), &self.keyframes[..]);
@@ -721,7 +721,7 @@ impl Session {
         let checkpoint = match self.checkpoints.as_mut().map(|checkpoints| checkpoints.take(snapshot)).transpose() {
             Ok(checkpoint) => checkpoint,
             Err(error) => {
-                log::warn!("no checkpoint of the last state: {error:#}"); // The model matters more.
+                log::warn!("cannot write a checkpoint of the last state: {error:#}"); // The model matters more.
                 None
             }
         };
@@ -736,7 +736,7 @@ impl Session {
         }
     }
 
-    /// Saves the model in a folder for temporary files, because that of its run refused it.
+    /// Saves the model in a folder for temporary files, because that of its run could not be written.
     fn save_elsewhere(&mut self, out: &Path, refused: anyhow::Error) -> anyhow::Result<Saved> {
         let save = |method: &mut dyn Method| {
             let folder = run_folder::make_rescue()?;
@@ -752,18 +752,18 @@ impl Session {
             }
             Err(error) => {
                 let error: anyhow::Error = error;
-                log::error!("cannot save the model in a folder for temporary files either: {error:#}");
+                log::error!("cannot save the model among the temporary files either: {error:#}");
                 Err(refused.context(format!("cannot save the model in {}; {}", out.display(), self.what_is_left())))
             }
         }
     }
 
-    /// What to continue from where the model could not be saved, as part of a sentence.
+    /// What to continue from if the model could not be saved, as part of a sentence.
     fn what_is_left(&mut self) -> String {
         let has_checkpoint = self.has_checkpoint();
         let Some(recovery) = &self.recovery else { return "there is no checkpoint either".to_owned() };
         let left = recovery.what_is_left(has_checkpoint);
-        if has_checkpoint { format!("{left}; --out names another folder for the model") } else { left }
+        if has_checkpoint { format!("{left}; use --out to save the model in another folder") } else { left }
     }
 
     /// Scores the saved model a last time, writes the report, and tells the end.
@@ -841,7 +841,7 @@ impl Session {
         images.iter().map(|scores| NamedScores { name: name(scores), scores }).collect()
     }
 
-    /// Draws test images as the model predicts them; `scores` are theirs, in the same order.
+    /// Renders test images for the report; `scores` are those of the test images, in the same order.
     fn compare(&mut self, scores: &[ImageScores]) -> anyhow::Result<Vec<report::Comparison>> {
         let name = |scores: &ImageScores| self.data.image_name(&scores.camera, scores.stamp_nanos);
         let scored = self.tests.iter().zip(scores).map(|(keyframe, scores)| report::Scored {
@@ -874,12 +874,12 @@ impl Session {
         page.write()
     }
 
-    /// Lists where the model has the cameras of its keyframes; without the list a viewer starts from outside the model.
+    /// Writes the list of camera poses with the model's corrections; without it, a viewer starts outside the model.
     fn write_cameras(&mut self, out: &Path) {
         let mut cameras = Vec::new();
         for keyframe in &self.keyframes {
             let lens = self.method.posed_lens(keyframe).unwrap_or_else(|error| {
-                log::debug!("the camera of a keyframe is listed without its correction: {error}");
+                log::debug!("a camera is listed without the learned correction: {error}");
                 PosedLens::of(keyframe)
             });
             cameras.push(camera_list::PosedCamera {
@@ -964,14 +964,14 @@ impl Session {
         Ok(done)
     }
 
-    /// Opens the mark that was reached: what was queued up to here belongs to it.
+    /// Opens the evaluation that is due; it scores the model after all steps queued so far.
     fn open_mark(&mut self) -> anyhow::Result<()> {
         self.method.n_taken()?;
         self.open_mark = Some(OpenMark::new(self.secs(), self.tests.iter(), self.most_at_marks));
         Ok(())
     }
 
-    /// Reports a mark that was scored.
+    /// Reports a completed evaluation.
     fn tell_mark(&mut self, mark: OpenMark) -> anyhow::Result<()> {
         let seconds = mark.seconds;
         let images = mark.into_images();
@@ -1035,7 +1035,7 @@ impl Session {
     }
 }
 
-/// What a checkpoint knows a keyframe by.
+/// The parts of a keyframe by which a checkpoint recognizes it.
 fn without_pixels(keyframe: &Keyframe) -> Keyframe {
     let depth = keyframe.depth.as_ref().map(|depth| DepthMap { depth_m: [].into(), ..depth.clone() });
     Keyframe { rgba_srgb: [].into(), depth, truth: None, ..keyframe.clone() }

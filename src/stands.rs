@@ -98,9 +98,9 @@ impl Stands {
         })
     }
 
-    /// Continues after the keyframes of an earlier run: where the base stands first now is looked for among them.
+    /// Continues after the keyframes of an earlier run: the base's first stand is looked for among them.
     pub(crate) fn after(mut self, keyframes: &[Arc<Keyframe>]) -> Self {
-        /// Of the earlier run: no stand of this one has this number.
+        /// For the earlier run: no stand of this run has this number.
         const EARLIER: usize = usize::MAX;
         if let Some(place) = keyframes.iter().rev().find_map(|keyframe| keyframe.base.as_ref()) {
             (self.stand, self.world_from_base, self.world_from_told) =

@@ -1,6 +1,6 @@
 //! Signals that end a run: it stops, saves, and exits.
 //!
-//! SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal closed) ask for an orderly end. A second Ctrl-C ends the process at once;
+//! SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal closed) request an orderly stop. A second Ctrl-C ends the process at once;
 //! SIGHUP never does, because a closing terminal sends it more than once: the kernel to the foreground group, the shell to its jobs.
 //! Under `nohup`, where SIGHUP is ignored, it stays ignored.
 
@@ -13,7 +13,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 /// Exit code of a process ended by an interrupt, as shells report it: 128 + SIGINT.
 const INTERRUPTED: i32 = 130;
 
-/// Whether the end was asked for. Clones share the answer.
+/// Whether a stop was requested. Clones share the state.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Stop {
     /// By the program itself.
@@ -22,14 +22,14 @@ pub(crate) struct Stop {
     signaled: Arc<AtomicBool>,
     /// Whether the signal was logged.
     logged: Arc<AtomicBool>,
-    /// What is logged then.
+    /// The message to log then.
     message: &'static str,
 }
 
 impl Stop {
-    /// Listens to SIGINT, SIGTERM and SIGHUP; at most once a process.
+    /// Handles SIGINT, SIGTERM and SIGHUP; at most once per process.
     pub(crate) fn on_ctrl_c() -> anyhow::Result<Self> {
-        Self::on_ctrl_c_logging("stopping and saving; Ctrl-C again ends at once")
+        Self::on_ctrl_c_logging("stopping and saving; Ctrl-C again exits at once")
     }
 
     /// As [`Self::on_ctrl_c`], for a command that saves nothing.
@@ -37,16 +37,16 @@ impl Stop {
         let stop = Self { message, ..Self::default() };
         let interrupted = Arc::new(AtomicBool::new(false));
         let register = || -> std::io::Result<()> {
-            // Actions of a signal run in the order in which they were registered: the first Ctrl-C only sets the flags.
+            // A signal's actions run in the order of registration: the first Ctrl-C only sets the flags.
             flag::register_conditional_shutdown(SIGINT, INTERRUPTED, interrupted.clone())?;
             flag::register(SIGINT, interrupted)?;
             ending_signals().try_for_each(|signal| flag::register(signal, stop.signaled.clone()).map(drop))
         };
-        register().context("cannot listen to signals")?;
+        register().context("cannot install signal handlers")?;
         Ok(stop)
     }
 
-    /// Asks for the end.
+    /// Requests a stop.
     pub(crate) fn ask(&self) {
         self.asked.store(true, Ordering::Relaxed);
     }
@@ -56,7 +56,7 @@ impl Stop {
         self.asked.load(Ordering::Relaxed) || self.signaled()
     }
 
-    /// Whether a signal asked for the end.
+    /// Whether a signal requested a stop.
     pub(crate) fn signaled(&self) -> bool {
         let signaled = self.signaled.load(Ordering::Relaxed);
         if signaled && !self.logged.swap(true, Ordering::Relaxed) {

@@ -11,8 +11,8 @@ pub(crate) const TURN: Duration = Duration::from_millis(40);
 
 /// Lets the model learn that had the least time of those that can, then tells what is due of all.
 ///
-/// `n_most`: most steps of a session now, by its place among them. `is_awaited`: whether somebody waits for the turn's end, which
-/// then comes after the submit under way.
+/// `n_most`: maximum number of steps of a session in this turn, by its index. `is_awaited`: whether a picture waits for the end
+/// of the turn, which then comes after the current submit.
 pub(crate) fn take(
     sessions: &mut [Session],
     n_most: impl Fn(usize, &Session) -> u64,

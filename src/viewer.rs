@@ -1,4 +1,4 @@
-//! Draws finished models for the page: the loop of a run without devices and training.
+//! Draws saved or finished models for the page: the loop of a run without devices and training.
 
 use crate::method::Kind;
 use crate::stop::Stop;
@@ -7,18 +7,18 @@ use std::time::Duration;
 use trainer::{Aabb, Method, RenderRequest};
 use viz::{Hub, PendingRender};
 
-/// How long Ctrl-C may go unnoticed while no client asks for anything.
+/// Longest time until Ctrl-C is noticed while no client requests a picture.
 const WAIT: Duration = Duration::from_millis(100);
 
-/// A model that clients can look at.
+/// A model that clients can view.
 pub(crate) struct ShownModel {
     pub(crate) kind: Kind,
     pub(crate) method: Box<dyn Method>,
 }
 
-/// Models that no longer change, and the hub whose clients look at them.
+/// Models that no longer change, and the hub of the clients that view them.
 pub(crate) struct Viewer {
-    /// The first is drawn for clients that do not name a method.
+    /// The first is drawn for clients that name no method.
     models: Vec<ShownModel>,
     hub: Hub,
     /// The page is z up; a model may not be.
@@ -36,7 +36,7 @@ impl Viewer {
         Self { model_from_page, ..self }
     }
 
-    /// Draws what clients ask for until a signal asks for the end.
+    /// Draws requested pictures until a signal requests a stop.
     pub(crate) fn serve(&mut self, stop: &Stop) {
         while !stop.signaled() {
             if self.hub.wait_for_request(WAIT)
@@ -54,7 +54,7 @@ impl Viewer {
         let Some(model) = self.models.iter_mut().find(is_wanted) else {
             let names: Vec<&str> = self.models.iter().map(|model| model.kind.name()).collect();
             let wanted = wanted.unwrap_or_default();
-            return pending.fail(&format!("no model of the method {wanted:?} here, only {}", names.join(", ")));
+            return pending.fail(&format!("no model with the method {wanted:?}, only {}", names.join(", ")));
         };
         match model.method.render(&request) {
             Ok(picture) => pending.deliver(picture),
@@ -63,7 +63,7 @@ impl Viewer {
     }
 }
 
-/// A request of the page in the model's own world frame.
+/// The page's request in the model's world frame.
 fn in_model(request: &RenderRequest, model_from_page: &Transform) -> RenderRequest {
     let crop = request.crop.map(|crop| Aabb { world_from_box: model_from_page * crop.world_from_box, ..crop });
     RenderRequest { world_from_camera: model_from_page * request.world_from_camera, crop, ..request.clone() }

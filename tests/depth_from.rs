@@ -72,7 +72,7 @@ fn images_without_depth_are_learned_with_that_of_a_model_again_and_again_alike()
     let repeated = done(folder, &[&replay[..], &with(&["--out", "repeated"])].concat());
     assert_eq!(repeated["checkpoint_sha256"], *sum, "the log gives another model");
 
-    // A checkpoint names the model, and a resumed run finds it by itself; a decision log has only its hash.
+    // A checkpoint names the model, and a resumed run finds it without a flag; a decision log has only its hash.
     let found = done(folder, &[&resume[..], &["--out", "found"]].concat());
     assert_eq!(found["checkpoint_sha256"], *sum, "resumed without --depth-from");
     refused(folder, &replay, 2, "name it with --depth-from");

@@ -102,7 +102,7 @@ fn memory_of_a_run_is_measured_with_a_viewer() {
     assert!(number(last, "pictures") >= 1.0 && number(last, "viewers") == 1.0, "{last}");
     assert!(number(last, "step") > number(first, "step"), "{first} {last}");
     assert!(number(last, "keyframes") <= 8.0 && number(last, "evicted") > 0.0, "{last}");
-    // Color, depth and truth of so many images of 160x120.
+    // Color, depth and ground truth of this many images of 160x120.
     assert_eq!(number(last, "keyframe_bytes"), number(last, "keyframes") * 160.0 * 120.0 * 12.0);
     assert!(number(last, "model_bytes") > 0.0 && number(last, "model_bytes") < number(last, "gpu_bytes"), "{last}");
     assert!(number(last, "resident_bytes") > number(last, "keyframe_bytes"), "{last}");

@@ -1,5 +1,5 @@
-//! A GPU that is lost in the middle of a run, and one without memory: the run continues, or stops with what it has.
-#![expect(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+//! A GPU that is lost during a run or has too little memory: the run continues, or stops without losing what it has.
+#![expect(clippy::unwrap_used, reason = "a test that cannot continue may panic")]
 
 mod photos;
 
@@ -86,7 +86,7 @@ fn a_gpu_without_memory_for_more_splats_keeps_those_it_has() {
         fieldrig(folder, &["train", "data", "--json", "--steps", "300", "--plan-steps", "1500", "--out", out], env)
     };
     let free = done(&train("free", &[]));
-    // Room for the first 50 000 splats and for drawing them, but not for half as many more.
+    // Memory for the first 50 000 splats and for drawing them, but not for half as many more.
     let full = train("full", &[("FIELDRIG_TEST_GPU_BYTES", "48000000")]);
     let text = stderr(&full);
     assert_eq!(text.matches("the model stops growing at").count(), 1, "{text}");
@@ -94,7 +94,7 @@ fn a_gpu_without_memory_for_more_splats_keeps_those_it_has() {
     assert_eq!(full["steps"], 300);
     assert!(full["primitives"].as_u64() < free["primitives"].as_u64(), "{full} {free}");
 
-    // Not even enough to begin: one sentence, and no panic.
+    // Not even enough memory to begin: one sentence, and no panic.
     let none = train("none", &[("FIELDRIG_TEST_GPU_BYTES", "3000000")]);
     assert_eq!(none.status.code(), Some(1));
     assert!(stderr(&none).contains("the GPU ran out of memory: buffer"), "{}", stderr(&none));
@@ -115,7 +115,7 @@ fn a_live_run_that_loses_its_gpu_continues_and_one_that_cannot_keeps_its_recordi
     };
     let lost = run("lost", &[("FIELDRIG_TEST_LOSE_GPU_AT_STEP", "120")]);
     let text = stderr(&lost);
-    assert!(text.contains("the GPU is back: training continues from"), "{text}");
+    assert!(text.contains("reopened the GPU: training continues from"), "{text}");
     assert_eq!(done(&lost)["steps"], 200);
 
     let gone = run("gone", &[("FIELDRIG_TEST_LOSE_GPU_AT_STEP", "120"), ("FIELDRIG_TEST_OPEN_GPU_ONCE", "1")]);
@@ -128,7 +128,7 @@ fn a_live_run_that_loses_its_gpu_continues_and_one_that_cannot_keeps_its_recordi
     );
     let listed = std::fs::read_to_string(folder.join("gone/keyframes.txt")).unwrap();
     assert!(listed.lines().count() >= 12, "{listed}");
-    // The recording is closed: it can be trained on as it is.
+    // The recording is closed properly: it can be trained on.
     let args = ["train", "gone.mcap", "--json", "--steps", "20", "--max-splats", "500", "--out", "again"];
     let again = fieldrig(folder, &args, &[]);
     assert!(again.status.success(), "{}", stderr(&again));

@@ -1,6 +1,6 @@
-//! Output that cannot be written never costs what is being made: closed terminals, closed pipes, full disks.
+//! Output that cannot be written never costs the result: closed terminals, closed pipes, full disks.
 #![cfg(target_os = "linux")]
-#![expect(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+#![expect(clippy::unwrap_used, reason = "a test that cannot continue may panic")]
 
 mod small_rig;
 mod wall;
@@ -15,12 +15,12 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
 const EXE: &str = env!("CARGO_BIN_EXE_fieldrig");
-/// Longer than any of these commands takes to end on a busy machine.
+/// Longer than any of these commands takes on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(240);
-/// A loss, as `--help` names it: lines of output.
+/// Exit code of a loss, which includes lost lines of output.
 const LOSS: i32 = 3;
 
-/// A program on a terminal of its own, which can be closed.
+/// A program on a pseudoterminal that can be closed.
 struct OnTerminal {
     child: Child,
     terminal: File,
@@ -28,7 +28,7 @@ struct OnTerminal {
 }
 
 impl OnTerminal {
-    /// Starts `fieldrig`; with `controlled` the terminal controls it, as that of a person does, and sends SIGHUP when it closes.
+    /// Starts `fieldrig`. With `controlled` the terminal is its controlling terminal, as for a person, and closing it sends SIGHUP.
     fn start(folder: &Path, args: &[&str], controlled: bool) -> Self {
         let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
         grantpt(&master).unwrap();
@@ -43,7 +43,7 @@ impl OnTerminal {
         Self { child, terminal: File::from(master), said: Vec::new() }
     }
 
-    /// Reads until the program has printed this.
+    /// Reads until the program has printed this text.
     fn wait_for(&mut self, text: &str) {
         let mut bytes = [0; 4096];
         while !self.said.windows(text.len()).any(|window| window == text.as_bytes()) {
@@ -53,7 +53,7 @@ impl OnTerminal {
         }
     }
 
-    /// Closes the terminal; the program's end comes back.
+    /// Closes the terminal; returns the program's exit status.
     fn close(self) -> ExitStatus {
         drop(self.terminal);
         end_of(self.child)
@@ -124,7 +124,7 @@ fn a_training_does_not_wait_for_a_terminal_that_takes_no_output() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     wall::write(&folder.join("data"), true, 0.0);
-    // As behind a broken connection: the terminal is there, and nobody reads. 8 kB fill it.
+    // As behind a broken connection: the terminal exists, but nobody reads. 8 kB fill it.
     let args = ["train", "data", "--steps", "300", "--max-splats", "600", "--out", "out", "-vv"];
     let mut run = OnTerminal::start(folder, &args, true);
     run.wait_for("step");
@@ -159,11 +159,11 @@ fn a_training_survives_a_closed_pipe_and_a_full_disk_behind_stdout() {
     assert_eq!(output.status.code(), Some(LOSS), "{said}");
     assert!(said.contains("cannot write to stdout") && said.contains("No space left"), "{said}");
     expect_model(folder, "full");
-    // Without stderr, too.
+    // Without stderr as well.
     assert_eq!(train("mute").stdout(full()).stderr(full()).status().unwrap().code(), Some(LOSS));
     expect_model(folder, "mute");
 
-    // Where the output is the result, a reader that went away is no loss.
+    // If the output is the result, a reader that closes the pipe is no loss.
     let mut fk = Command::new(EXE);
     fk.args(["metrics", "data/00.png", "data/00.png"]).current_dir(folder);
     assert_eq!(fk.stdout(full()).output().unwrap().status.code(), Some(1), "the result is lost");
@@ -200,7 +200,7 @@ struct SmallDisk<'a>(&'a Path);
 
 #[cfg(feature = "sim")]
 impl<'a> SmallDisk<'a> {
-    /// None where this user may not mount one.
+    /// `None` if this user may not mount one.
     fn mount(at: &'a Path, size: &str) -> Option<Self> {
         std::fs::create_dir(at).unwrap();
         let option = format!("size={size}");
@@ -235,12 +235,12 @@ fn on_a_full_disk_a_recording_is_read_as_reported_and_a_model_is_saved_elsewhere
     let count = |key: &str| reported[key].as_u64().unwrap();
     let n_samples = ["images", "depth_images", "joint_states", "truths"].map(count).iter().sum::<u64>();
     assert!(said.contains(&format!("({n_samples} samples)")), "{n_samples}: {said}");
-    // One number everywhere: the reader counts the same.
+    // The same number everywhere: a reader counts as many samples.
     let read = wall::fieldrig(folder, &["export", "disk/run.mcap", "--to", "nerfstudio", "--out", "read"]);
     let read_said = String::from_utf8_lossy(&read.stderr);
     assert!(read_said.contains(&format!("after {n_samples} readable samples")), "{n_samples}: {read_said}");
 
-    // Room for the lists, not for the model.
+    // Enough space for the lists, but not for the model.
     std::fs::remove_file(disk.join("run.mcap")).unwrap();
     std::fs::write(disk.join("filler"), vec![1; 900 << 10]).unwrap();
     wall::write(&folder.join("data"), true, 0.0);
@@ -258,7 +258,7 @@ fn on_a_full_disk_a_recording_is_read_as_reported_and_a_model_is_saved_elsewhere
     assert!(said.contains("cannot save the model in disk/out, it was saved in "), "{said}");
     let saved = std::fs::read_dir(&temporary).unwrap().next().unwrap().unwrap().path();
     expect_model(folder, saved.strip_prefix(folder).unwrap().to_str().unwrap());
-    assert!(!disk.join("out/model.part").exists(), "what is not whole takes no room");
+    assert!(!disk.join("out/model.part").exists(), "the incomplete file is removed");
 
     std::fs::remove_dir_all(disk.join("out")).unwrap();
     let output = train(&disk);

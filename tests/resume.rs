@@ -55,14 +55,14 @@ fn two_halves_give_the_bits_of_the_whole() {
     let [one, other] = ["whole", "both"].map(|run| Checkpoint::read(&folder.join(run).join("training.ckpt")).unwrap());
     assert!(one.state == other.state && one.arrays == other.arrays);
 
-    // A run that reached its limit reports that, and changes nothing.
+    // A run that reached its limit reports that and changes nothing.
     let finished = train(folder, &["--resume", "both"]).output().unwrap();
     assert_eq!(finished.status.code(), Some(0), "{}", String::from_utf8_lossy(&finished.stderr));
     let finished: Value = serde_json::from_slice(&finished.stdout).unwrap();
     assert_eq!((&finished["event"], &finished["out"]), (&json!("finished"), &json!("both")));
     assert!(!folder.join("runs").exists());
 
-    // Asked for as many steps again, it saves what there is. The folder holds a model and is not written to.
+    // Asked for the number of steps it has already made, it saves the model in a new folder, because its own already holds a model.
     let again = done(folder, &["--resume", "both", "--steps", N_STEPS, "--checkpoint-secs", "0"]);
     assert_eq!(again["checkpoint_sha256"], whole["checkpoint_sha256"]);
     let out = folder.join(again["out"].as_str().unwrap());
@@ -178,7 +178,7 @@ fn a_run_that_is_killed_again_and_again_ends_with_the_same_bits() {
     assert!(folder.join("killed/splats.ply").exists(), "it went on in its own folder");
 }
 
-/// Kills a live run, continues it, and expects it to end as one run: with its time, its keyframes and more steps.
+/// Kills a live run, continues it, and checks that the result is that of one run: with its time, its keyframes and more steps.
 #[cfg(feature = "sim")]
 #[test]
 fn a_live_run_that_is_killed_continues_with_its_keyframes_and_its_clock() {
@@ -222,7 +222,7 @@ fn a_live_run_that_is_killed_continues_with_its_keyframes_and_its_clock() {
     let stamps = list.lines().filter_map(|line| line.split(' ').nth(1)?.parse::<i64>().ok());
     assert!(stamps.clone().count() >= n_kept && stamps.is_sorted(), "{list}");
 
-    // It is finished now, and a longer time continues it in a new folder.
+    // It is finished now; a longer time limit continues it in a new folder.
     let finished = run(&["--resume", "out"]).output().unwrap();
     assert!(finished.status.success());
     assert!(String::from_utf8_lossy(&finished.stdout).contains("\"finished\""));

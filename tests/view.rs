@@ -1,4 +1,4 @@
-//! `fieldrig view` and the report page of a training: what a browser gets, and what is refused.
+//! `fieldrig view` and the report page of training: what a browser receives, and what is refused.
 
 mod wall;
 
@@ -11,13 +11,13 @@ use std::time::Duration;
 use tungstenite::{Message, WebSocket};
 use wall::fieldrig;
 
-/// Far more than two busy cores need for a small picture.
+/// Far longer than two busy cores need for a small picture.
 const PATIENCE: Duration = Duration::from_secs(120);
 const SIZE_PX: [u32; 2] = [96, 72];
 /// Angle from the top to the bottom of a picture, degrees.
 const FOV_DEGREES: f64 = 50.0;
 
-/// Trains on the photos of a wall; what was printed comes back.
+/// Trains on the photos of a wall; returns the output.
 fn train(folder: &Path, args: &[&str]) -> String {
     let output = fieldrig(folder, &[&["train"], args].concat());
     assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
@@ -49,7 +49,7 @@ impl View {
         url.trim_start_matches("http://").trim_end_matches('/').parse().expect("numbers")
     }
 
-    /// Ends it as Ctrl-C does.
+    /// Ends it with SIGINT, as Ctrl-C does.
     fn interrupt(mut self) -> ExitStatus {
         let kill = format!("kill -INT {}", self.process.id());
         assert!(Command::new("sh").args(["-c", &kill]).status().expect("sh starts").success());
@@ -106,7 +106,7 @@ impl Client {
         found
     }
 
-    /// The picture of a pose, decoded; or why there is none.
+    /// The decoded picture from a pose, or the reason why there is none.
     fn ask(&mut self, pose: &[f64], method: Option<&str>) -> Result<image::RgbImage, String> {
         self.n_asked += 1;
         let mut message = json!({
@@ -135,7 +135,7 @@ fn pose_of(message: &Value) -> Vec<f64> {
     pose.iter().map(|number| number.as_f64().expect("a number")).collect()
 }
 
-/// What `render` draws of a model at a pose.
+/// The picture that `render` draws of a model from a pose.
 fn rendered(folder: &Path, model: &str, pose: &[f64], out: &str) -> image::RgbImage {
     let pose = pose.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
     let (size, fov) = (format!("{}x{}", SIZE_PX[0], SIZE_PX[1]), FOV_DEGREES.to_string());
@@ -157,7 +157,7 @@ fn brightness(picture: &image::RgbImage) -> f64 {
     picture.as_raw().iter().map(|value| f64::from(*value)).sum::<f64>() / picture.as_raw().len() as f64
 }
 
-/// What JPEG at quality 92 changes of these pictures: measured 1.0.
+/// Bound on the change by JPEG compression at quality 92 in these pictures: measured 1.0.
 const MOST_FROM_JPEG: f64 = 3.0;
 
 #[test]
@@ -202,7 +202,7 @@ fn saved_models_are_shown_as_render_draws_them() {
     without_cameras(folder);
 }
 
-/// A model without a list of cameras is seen from outside, whichever axis is up.
+/// A model without a list of cameras is first seen from outside, whichever axis is up.
 fn without_cameras(folder: &Path) {
     let model = folder.join("all/splat/splats.ply");
     std::fs::copy(&model, folder.join("lone.ply")).expect("room on the disk");
@@ -220,7 +220,7 @@ fn without_cameras(folder: &Path) {
         let seen = client.ask(&start, None).expect("a picture");
         assert!(brightness(&seen) > 2.0, "{model}, {up} up: nothing is seen from {start:?}");
         if up == "-y" {
-            // What is up on the page is -y in the model: its world is the page's, turned by a quarter about x.
+            // Up on the page is -y in the model: the page's world rotated by a quarter turn about x.
             let [x, y, z] = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]];
             let row = |row: [f64; 4]| (0..4).map(move |column| (row, column));
             let product =
@@ -234,7 +234,7 @@ fn without_cameras(folder: &Path) {
     }
 }
 
-/// Asserts the exit code and one sentence on stderr that holds every word of `words`.
+/// Asserts the exit code and one sentence on stderr that contains all `words`.
 fn assert_refused(folder: &Path, args: &[&str], code: i32, words: &[&str]) {
     let output = fieldrig(folder, args);
     let printed = String::from_utf8_lossy(&output.stderr);
@@ -276,7 +276,7 @@ fn a_port_that_was_named_and_is_in_use_is_refused_and_the_usual_one_is_replaced(
     let taken = TcpListener::bind("127.0.0.1:0").expect("a free port");
     let address = taken.local_addr().expect("bound").to_string();
     assert_refused(folder, &["view", "model", "--listen", &address], 1, &[&address, "in use", "--listen"]);
-    // Held by this test, or by somebody else already.
+    // Taken by this test, or already in use.
     let _usual = TcpListener::bind("127.0.0.1:7007");
     let view = View::start(folder, &["model"]);
     assert_ne!(view.address().port(), 7007);
@@ -342,7 +342,7 @@ fn a_training_prints_commands_that_work_as_printed_and_writes_a_page() {
     // Image, render, error and depth of both test images.
     assert_eq!(pictures.len(), 8);
     assert!(pictures.iter().all(|picture| picture.dimensions() == (36, 27)), "photos of 48x36, shrunk");
-    // The render is of its own test image rather than of the other one.
+    // Each render is of its own test image rather than of the other one.
     let [to_own, to_other] = [0, 4].map(|ix| difference(&pictures[ix], &pictures[1]));
     assert!(to_own < 0.7 * to_other && brightness(&pictures[1]) > 30.0, "{to_own} {to_other}");
     let others = page.replace("http://www.w3.org/2000/svg", "");

@@ -1,4 +1,4 @@
-//! Looks for the bundled web page and compresses it; without it the server shows a page that names `make web`.
+//! Finds and compresses the bundled web page. Without the bundle, the server shows a page that says to run `make web`.
 
 use flate2::Compression;
 use flate2::write::GzEncoder;

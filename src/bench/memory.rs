@@ -1,14 +1,14 @@
-//! Memory of this process over time, and how fast it grows once everything that is bounded is full.
+//! Memory of this process over time, and its growth rate once all bounded stores are full.
 
 use super::statistics::{median, slope};
 use anyhow::{Context, anyhow};
 use serde::Serialize;
 
-/// After the keyframe store is full, this long does not count: buffers take on their sizes.
+/// Time after the keyframe store is full that is ignored, while buffers reach their final size.
 const SETTLE_SECS: f64 = 60.0;
-/// Least length of what a rate is measured over.
+/// Minimum length of the time over which a rate is measured.
 const MIN_SPAN_SECS: f64 = 60.0;
-/// Samples that a rate is measured with; more are thinned to medians of as many groups.
+/// Maximum number of samples for a rate; more samples are reduced to the medians of this many groups.
 const MAX_GROUPS: usize = 400;
 const SECS_PER_HOUR: f64 = 3600.0;
 
@@ -17,11 +17,11 @@ const SECS_PER_HOUR: f64 = 3600.0;
 pub(crate) struct Sample {
     /// Since the first image.
     pub(crate) seconds: f64,
-    /// Of the process; on a software adapter with the GPU's.
+    /// Of the process; on a software adapter this includes the GPU's memory.
     pub(crate) resident_bytes: u64,
-    /// Live GPU buffers.
+    /// GPU buffers in use.
     pub(crate) gpu_bytes: u64,
-    /// What the GPU's allocator holds for them, where the backend reports it.
+    /// Memory that the GPU's allocator holds for them, if the backend reports it.
     pub(crate) gpu_reserved_bytes: Option<u64>,
     /// Of the models, a part of `gpu_bytes`.
     pub(crate) model_bytes: u64,
@@ -30,10 +30,10 @@ pub(crate) struct Sample {
     /// Host memory of the keyframes held.
     pub(crate) keyframe_bytes: u64,
     pub(crate) keyframes: usize,
-    /// Keyframes that made room for others.
+    /// Keyframes evicted so far.
     pub(crate) evicted: u64,
     pub(crate) step: u64,
-    /// Connected viewers, and the pictures they got.
+    /// Connected viewers, and the pictures they received.
     pub(crate) viewers: usize,
     pub(crate) pictures: u64,
 }
@@ -41,11 +41,11 @@ pub(crate) struct Sample {
 /// Which part of resident memory is measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Beyond {
-    /// All of it: GPU buffers lie elsewhere.
+    /// All of it: GPU buffers are in other memory.
     Nothing,
-    /// What is not the models' own.
+    /// All but the models.
     Model,
-    /// What is neither the models' nor working memory of training, whose size goes with the models'.
+    /// All but the models and the working memory of training, whose size grows with the models.
     Training,
 }
 
@@ -63,21 +63,21 @@ impl Beyond {
 /// How fast memory grows once the keyframe store is full.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub(crate) struct Growth {
-    /// Whether the store was full; else the second half of the run is measured.
+    /// Whether the store was full; otherwise the second half of the run is measured.
     pub(crate) store_was_full: bool,
-    /// What is measured, seconds since the first image.
+    /// Start and end of the measurement, seconds since the first image.
     pub(crate) from_seconds: f64,
     pub(crate) to_seconds: f64,
     /// Median resident memory in that time.
     pub(crate) resident_bytes: f64,
-    /// By the median of the slopes between all pairs of samples.
+    /// Theil-Sen slope: the median of the slopes between all pairs of samples.
     pub(crate) bytes_per_hour: f64,
     /// The same as a share of `resident_bytes`.
     pub(crate) percent_per_hour: f64,
 }
 
 impl Growth {
-    /// `None` where what counts is shorter than a minute.
+    /// `None` if less than a minute of samples counts.
     pub(crate) fn of(samples: &[Sample], beyond: Beyond) -> Option<Self> {
         let full_at = samples.iter().find(|sample| sample.evicted > 0).map(|sample| sample.seconds + SETTLE_SECS);
         let last = samples.last()?;
@@ -105,7 +105,7 @@ impl Growth {
     }
 }
 
-/// Resident memory of this process now and at most, bytes.
+/// Current and peak resident memory of this process, bytes.
 pub(crate) fn resident_bytes() -> anyhow::Result<(u64, u64)> {
     const STATUS: &str = "/proc/self/status";
     let status = std::fs::read_to_string(STATUS)
@@ -123,7 +123,7 @@ fn kilobytes(status: &str, name: &str) -> Option<u64> {
 mod tests {
     use super::*;
 
-    /// A store that is full after 100 s, and `bytes` after so many seconds.
+    /// Samples of a store that is full after 100 s, with `bytes` as a function of the seconds.
     fn samples(n: u32, bytes: impl Fn(f64) -> f64) -> Vec<Sample> {
         let sample = |ix: u32| {
             let seconds = f64::from(ix);

@@ -91,7 +91,7 @@ fn write_file(place: &Path, bytes: &[u8]) -> anyhow::Result<()> {
 }
 
 impl Table {
-    /// The table and its title for a page.
+    /// The table with its title, as HTML for a page.
     pub(crate) fn html(&self) -> String {
         let row = |cells: &[String], tag: &str| {
             let cells: String = cells.iter().map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell))).collect();

@@ -46,9 +46,9 @@ pub(crate) fn secs_to(curve: &[(f64, f64)], wanted_db: f64) -> Option<f64> {
     Some(earlier_secs * (secs / earlier_secs).powf(frac))
 }
 
-/// Slope of a line through `(x, y)`: the median of the slopes between all pairs. `None` below two values of x.
+/// Slope of a line through `(x, y)`: the median of the slopes between all pairs. `None` with fewer than two values of x.
 ///
-/// Source: Theil 1950, Sen 1968. A few values that lie off do not move it.
+/// Source: Theil 1950, Sen 1968. A few outliers do not change it.
 pub(crate) fn slope(points: &[(f64, f64)]) -> Option<f64> {
     let pairs = points.iter().enumerate().flat_map(|(ix, from)| points[ix + 1..].iter().map(move |to| (from, to)));
     let slopes: Vec<f64> =

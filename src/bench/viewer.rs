@@ -1,6 +1,6 @@
-//! A viewer of the page, for benches: a WebSocket client that asks for one picture after another and keeps none.
+//! A viewer for benches: a WebSocket client that requests pictures back to back and discards them.
 //!
-//! It runs in the process that it measures, so it reads through one small buffer.
+//! It runs in the measured process, so it reads through one small buffer.
 
 use anyhow::{Context, bail, ensure};
 use kinematics::Transform;
@@ -13,15 +13,15 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Size of the pictures it asks for, pixels.
+/// Size of the requested pictures, pixels.
 const SIZE_PX: [u32; 2] = [960, 720];
-/// Angle between two pictures as it circles the scene, radians.
+/// Angle between two pictures on the circle around the scene, radians.
 const TURN_RAD: f64 = 0.05;
-/// The server is taken for dead after this long without a byte: it sends its status several times a second.
+/// The connection counts as dead after this long without a byte: the server sends its status several times a second.
 const MAX_SILENCE: Duration = Duration::from_secs(120);
-/// Longest text message that is read: the list of keyframes.
+/// Maximum length of a text message; the list of keyframes is the longest.
 const MAX_TEXT_BYTES: u64 = 16 << 20;
-/// Longest header of a binary message.
+/// Maximum length of the header of a binary message.
 const MAX_HEADER_BYTES: u64 = 64 << 10;
 
 const TEXT: u8 = 1;
@@ -39,7 +39,7 @@ pub(crate) struct Viewer {
 }
 
 impl Viewer {
-    /// Connects to a server of this machine and starts to ask for pictures.
+    /// Connects to a server on this machine and starts to request pictures.
     pub(crate) fn connect(address: SocketAddr) -> anyhow::Result<Self> {
         let stream = TcpStream::connect(address).with_context(|| format!("cannot connect to {address}"))?;
         stream.set_read_timeout(Some(MAX_SILENCE)).context("cannot set a timeout")?;
@@ -62,7 +62,7 @@ impl Viewer {
         self.n_pictures.load(Ordering::Relaxed)
     }
 
-    /// Whether it still receives.
+    /// Whether it is still receiving.
     pub(crate) fn is_connected(&self) -> bool {
         self.thread.as_ref().is_some_and(|thread| !thread.is_finished())
     }
@@ -70,10 +70,10 @@ impl Viewer {
 
 impl Drop for Viewer {
     fn drop(&mut self) {
-        // Fails where the server was faster.
+        // Fails if the server has already closed the connection.
         let _ = self.stream.shutdown(Shutdown::Both);
         if let Some(Ok(Err(error))) = self.thread.take().map(JoinHandle::join) {
-            log::debug!("a viewer ended: {error:#}");
+            log::debug!("a viewer's connection ended: {error:#}");
         }
     }
 }
@@ -97,7 +97,7 @@ impl Client {
         )?;
         let mut line = String::new();
         self.reader.read_line(&mut line)?;
-        ensure!(line.starts_with("HTTP/1.1 101"), "the server answered {:?} in place of a WebSocket", line.trim_end());
+        ensure!(line.starts_with("HTTP/1.1 101"), "the server answered {:?}, expected a WebSocket", line.trim_end());
         while line.trim_end() != "" {
             line.clear();
             ensure!(self.reader.read_line(&mut line)? > 0, "the server closed the connection");
@@ -133,7 +133,7 @@ impl Client {
                 self.center_m = Point3::new(number(&center[0])?, number(&center[1])?, number(&center[2])?);
                 self.radius_m = number(&message["radius_m"])?;
             }
-            // Nothing was seen yet.
+            // There is no picture yet.
             Some("error") => {
                 std::thread::sleep(Duration::from_millis(200));
                 self.ask()?;
@@ -157,11 +157,11 @@ impl Client {
         Ok(())
     }
 
-    /// Asks for the next picture on a circle around the scene.
+    /// Requests the next picture on a circle around the scene.
     fn ask(&mut self) -> anyhow::Result<()> {
         let angle = self.n_asked as f64 * TURN_RAD;
         let away = Vector3::new(angle.cos(), angle.sin(), 0.7) * 1.5 * self.radius_m;
-        // `face_towards` has z forward and turns y up: a camera's y points down.
+        // `face_towards` has z forward and y up, but a camera's y axis points down.
         let world_from_camera = Transform::face_towards(&(self.center_m + away), &self.center_m, &-Vector3::z());
         let order = json!({
             "type": "render",
@@ -175,12 +175,12 @@ impl Client {
         self.send(TEXT, order.to_string().as_bytes())
     }
 
-    /// Kind and length of the next frame; the server sends each message as one.
+    /// Kind and length of the next frame; the server sends each message as one frame.
     fn next_frame(&mut self) -> anyhow::Result<(u8, u64)> {
         let mut head = [0; 2];
         self.reader.read_exact(&mut head)?;
         let is_whole = head[0] & 0x80 != 0;
-        ensure!(is_whole, "the server sent a message in pieces, expected whole ones");
+        ensure!(is_whole, "the server sent a fragmented message, expected one frame per message");
         let n_bytes = match head[1] {
             126 => {
                 let mut bytes = [0; 2];
@@ -204,7 +204,7 @@ impl Client {
         Ok(())
     }
 
-    /// Sends a frame. Its mask is zero: the server must unmask, and nothing on loopback has to be kept from guessing bytes.
+    /// Sends a frame. Its mask is zero: the protocol requires one, but on loopback there is no proxy to protect.
     fn send(&mut self, kind: u8, contents: &[u8]) -> anyhow::Result<()> {
         let mut frame = vec![0x80 | kind];
         match u8::try_from(contents.len()) {
@@ -251,7 +251,7 @@ mod tests {
             }
             n_drawn += 1;
         }
-        assert!(n_drawn >= 4, "one that failed and three pictures, of one stage each where the server draws fast");
+        assert!(n_drawn >= 4, "one failed request and three pictures, of one stage each if the server draws fast");
         drop(viewer);
         while hub.n_clients() > 0 {
             assert!(begun.elapsed() < Duration::from_secs(60));

@@ -142,7 +142,7 @@ fn export_splats(model: &Path, format: splat_file::Format, out: &Path) -> anyhow
     splat_file::write(out, format, &splats)?;
     partial.keep();
     let n_splats = counted(splats.n_splats() as u64, "splat");
-    print::report(format!("{n_splats} of colour degree {} -> {}", splats.sh_degree, out.display()));
+    print::report(format!("{n_splats} of color degree {} -> {}", splats.sh_degree, out.display()));
     Ok(Exit::Done)
 }
 

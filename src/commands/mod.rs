@@ -70,7 +70,7 @@ fn open_gpu_with(options: GpuOptions) -> anyhow::Result<Arc<Gpu>> {
     };
     recovery::hide_caught_panics();
     recovery::check_open_for_tests()?;
-    // For tests of running out of memory.
+    // Lets tests run out of GPU memory.
     let memory_limit_bytes = std::env::var("FIELDRIG_TEST_GPU_BYTES").ok().and_then(|text| text.parse().ok());
     let gpu = Gpu::open(&GpuOptions { optional_features, matrices, memory_limit_bytes, adapter, ..options })?;
     if gpu.is_software() {

@@ -161,7 +161,7 @@ fn tell(args: &Args, joints: &[String], target: &JointTarget, last: &JointState,
         let (target, position) = (&target.position[..], &last.position[..]);
         return print::report_json(&Arrived { event: "done", joints, target, position, error, seconds });
     }
-    print::report(format_args!("arrived after {seconds:.1} s at {}, {error:.5} off at most", told(&last.position)));
+    print::report(format_args!("arrived after {seconds:.1} s at {}, maximum error {error:.5}", told(&last.position)));
     Ok(())
 }
 

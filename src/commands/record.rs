@@ -91,7 +91,7 @@ impl Recorded {
         }
     }
 
-    /// What a reader finds in the file after writing failed; images that devices lost stay counted.
+    /// Counts what can be read from the file after writing failed; images that devices lost stay counted.
     fn recounted(self) -> Self {
         let mut found = Self { event: self.event, out: self.out, ..Self::default() };
         let mut first: Option<Stamp> = None;

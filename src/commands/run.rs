@@ -54,11 +54,11 @@ pub(crate) struct Args {
     /// Write everything that comes in to an MCAP file; what devices lose then is a loss (exit code 3), else the next image does
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
-    /// Continue a run that crashed or was stopped, from the checkpoint and the keyframes in its folder, with its flags: no other flag
-    /// is needed. What the robot sees from now on is added
+    /// Continue a run that crashed or was stopped, from the checkpoint and keyframes in its folder and with its flags; no other flag
+    /// is needed. New keyframes are added
     #[arg(long, value_name = "FOLDER", conflicts_with_all = ["from", "method", "seed", "max_bytes", "max_splats", "refine", "count"])]
     resume: Option<PathBuf>,
-    /// Stop after S seconds, counted from the first image, those before --resume included [default: run until Ctrl-C]
+    /// Stop S seconds after the first image, including the time before --resume [default: run until Ctrl-C]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
     /// Stop after N optimiser steps, or when the devices ended and there is nothing left to fuse; in lockstep one seed gives one
@@ -79,8 +79,8 @@ pub(crate) struct Args {
     out: Option<PathBuf>,
     #[command(flatten)]
     checkpoints: CheckpointArgs,
-    /// Whether the page stays until Ctrl-C after the run has reached its limit, or the program exits [default: stay on a terminal
-    /// without --json, else exit]
+    /// When the run has reached its limit, keep serving the page until Ctrl-C, or exit [default: stay on a terminal without --json,
+    /// else exit]
     #[arg(long, value_name = "WHAT")]
     when_done: Option<WhenDone>,
     /// Print one JSON object a line
@@ -88,21 +88,21 @@ pub(crate) struct Args {
     json: bool,
 }
 
-/// What follows a run that has reached its limit.
+/// What happens when a run has reached its limit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum WhenDone {
     /// Show the model on the page until Ctrl-C.
     Stay,
-    /// End.
+    /// Exit.
     Exit,
 }
 
-/// Reads an address of the page.
+/// Parses an address of the page.
 pub(super) fn address(text: &str) -> Result<SocketAddr, String> {
     text.parse().map_err(|_| "expected an address and a port, such as 127.0.0.1:7007".to_owned())
 }
 
-/// Names of flags in checkpoints.
+/// Names of the flags in checkpoints.
 const SECONDS: &str = "seconds";
 const STEPS: &str = "steps";
 const STEPS_PER_KEYFRAME: &str = "steps-per-keyframe";
@@ -158,7 +158,7 @@ fn drive(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
             Ok(true) => {}
             Ok(false) => match running.live.wait() {
                 Ok(false) => break Ok(()),
-                Ok(true) => {} // The model may lack steps again.
+                Ok(true) => {} // The restored model may have fewer steps.
                 Err(error) => break Err(error),
             },
             Err(error) => break Err(error),
@@ -178,12 +178,12 @@ fn drive(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
         return Err(error);
     }
     if live.is_through() {
-        log::info!("the devices ended, and all they told is in the model: no step is left to make");
+        log::info!("the devices ended and all their data is in the model: no training steps are left");
     }
     stop.ask();
     let (exit, models) = save(live, args, &rig, folders, &damage)?;
     if args.stays() && !models.is_empty() && !stop.signaled() {
-        print::report(format_args!("the page stays at {} until Ctrl-C", server.url()));
+        print::report(format_args!("the page remains at {} until Ctrl-C", server.url()));
         let shown = |Finished { kind, method, .. }| ShownModel { kind, method };
         Viewer::new(models.into_iter().map(shown).collect(), hub).serve(&stop);
     }
@@ -210,7 +210,7 @@ fn publish_end(hub: &Hub, models: &[Finished]) {
         seconds: models.iter().map(|model| model.seconds).fold(0.0, f64::max),
     });
     if hub.n_clients() > 0 {
-        std::thread::sleep(LAST_STATUS); // Clients show it also after the server has stopped.
+        std::thread::sleep(LAST_STATUS); // Clients keep showing it after the server has stopped.
     }
 }
 
@@ -226,7 +226,7 @@ pub(super) struct Running {
 }
 
 impl Running {
-    /// Takes keyframes, trains a slice, draws and publishes the status; returns `false` once the run is over or was interrupted.
+    /// Takes keyframes, trains a slice, draws and publishes the status; returns `false` when the run is over or interrupted.
     pub(super) fn take_turn(&mut self) -> anyhow::Result<bool> {
         if self.stop.asked() || self.live.is_over() {
             return Ok(false);
@@ -313,7 +313,7 @@ pub(super) fn start(args: &Args, earlier: Option<&Earlier>, made: &mut MadeFolde
             recipe: Recipe { kind, options },
             folder: folder.clone(),
             resumed: earlier.map(|earlier| earlier.folder.clone()),
-            known: Vec::new(), // The session holds all.
+            known: Vec::new(), // The session holds all of them.
             settings,
             resume_command: args.resume_command(folder),
         };
@@ -347,7 +347,7 @@ pub(super) fn start(args: &Args, earlier: Option<&Earlier>, made: &mut MadeFolde
     Ok(Running { live, gpu, server, stop, rig, folders, damage })
 }
 
-/// Closes the recording and writes the lists of keyframes where training cannot continue; the error says what is left.
+/// Closes the recording and writes the lists of keyframes when training cannot continue; the error names what was saved.
 fn keep_input(mut live: Live, folders: &[PathBuf], error: anyhow::Error) -> anyhow::Error {
     let left = live.what_is_left();
     let (sessions, leftover) = live.finish();
@@ -366,7 +366,7 @@ fn keep_input(mut live: Live, folders: &[PathBuf], error: anyhow::Error) -> anyh
         Err(error) => log::error!("{error:#}"),
     }
     let is_said = left.is_empty() || error.is::<GpuGone>();
-    if is_said { error } else { error.context(format!("the run broke off; {left}")) }
+    if is_said { error } else { error.context(format!("the run stopped early; {left}")) }
 }
 
 /// Saves what there is, then tells what went wrong on the way.
@@ -440,14 +440,14 @@ fn save(
     Ok((exit::after(&losses), models))
 }
 
-/// Camera and stamp of a keyframe that found no room.
+/// Camera and stamp of a keyframe for which there was no room.
 type Evicted = (Arc<str>, Stamp);
 
 /// A run to be continued.
 pub(super) struct Earlier {
     folder: PathBuf,
     checkpoint: Checkpoint,
-    /// Those it held, in the order of their stamps.
+    /// The keyframes it held, ordered by stamp.
     keyframes: Vec<Arc<Keyframe>>,
 }
 
@@ -467,7 +467,7 @@ impl Earlier {
         Ok(Self { folder: folder.to_owned(), checkpoint, keyframes })
     }
 
-    /// What of the rig file was settled by the flags of that run.
+    /// The rig file settings that the flags of that run set.
     fn overrides(&self) -> Vec<Override> {
         let realign = self.checkpoint.flags.get(REALIGN).map(|is_on| Override::new(REALIGN, is_on == "true"));
         let method = Kind::named(&self.checkpoint.method).map(|kind| Override::new("train.method", kind.name()));
@@ -484,13 +484,13 @@ impl Args {
         overrides
     }
 
-    /// Whether the page outlives the run.
+    /// Whether the page stays after the run.
     fn stays(&self) -> bool {
         let is_watched = !self.json && std::io::stdout().is_terminal();
         self.when_done.map_or(is_watched, |when_done| when_done == WhenDone::Stay)
     }
 
-    /// The flags that a resumed run finds in the checkpoint: values by names.
+    /// The flags to store in the checkpoint, by name.
     fn flags(&self, limits: Limits) -> BTreeMap<String, String> {
         let is_on = |flag: bool| flag.then(|| true.to_string());
         let given = [
@@ -506,7 +506,7 @@ impl Args {
         flags.chain(self.checkpoints.flag()).collect()
     }
 
-    /// These flags, and where they are not given those of the run that is resumed.
+    /// These flags, completed by those of the earlier run.
     fn with_flags_of(&self, earlier: &Earlier) -> Self {
         let flag = |name: &str| earlier.checkpoint.flags.get(name);
         let has_limit = self.seconds.is_some() || self.steps.is_some();
@@ -525,7 +525,7 @@ impl Args {
         }
     }
 
-    /// Whether the run to be resumed reached its limit and saved its model, and no flag asks for more.
+    /// Whether the earlier run reached its limit and saved its model, and no flag asks for more.
     fn is_finished(&self, earlier: &Earlier) -> bool {
         let asks_for_more = self.seconds.is_some() || self.steps.is_some();
         let has_model = || run_folder::refuse_model(&earlier.folder).is_err();
@@ -546,19 +546,19 @@ impl Args {
         Ok(Exit::Done)
     }
 
-    /// The folder asked for; a run that was cut off continues in its own.
+    /// The given folder; an unfinished run continues in its own folder.
     fn out(&self) -> Option<&Path> {
         let unfinished = || self.resume.as_deref().filter(|folder| run_folder::refuse_model(folder).is_ok());
         self.out.as_deref().or_else(unfinished)
     }
 
-    /// What to type to continue the run in a folder.
+    /// The command that continues the run in a folder.
     fn resume_command(&self, folder: &Path) -> String {
         let [rig, folder] = [&*self.rig_file, folder].map(|path| quoted(&path.to_string_lossy()));
         format!("fieldrig run {rig} --resume {folder}")
     }
 
-    /// What `eval` needs to score the model in `folder` on the images of this run.
+    /// The data and flags with which `eval` scores the model in `folder` on the images of this run.
     fn data_source(&self, folder: &Path) -> DataSource {
         // A recording that began with --resume lacks the images before it.
         let path = self.record.as_ref().or(self.from.as_ref()).filter(|_| self.resume.is_none()).cloned();
@@ -581,7 +581,7 @@ impl Args {
         }
     }
 
-    /// What goes in, after the keyframes of an earlier run; and those of them that have no room any more.
+    /// The input, after the keyframes of an earlier run; and those of its keyframes for which there is no room.
     fn input(
         &self,
         rig: &Rig,

@@ -32,7 +32,7 @@ use trainer::{Keyframe, Split};
 
 /// Length of a training where no flag says.
 const USUAL_SECONDS: f64 = 120.0;
-/// Names of flags in checkpoints.
+/// Names of the flags in checkpoints.
 const SECONDS: &str = "seconds";
 const STEPS: &str = "steps";
 const DEPTH_FROM: &str = "depth-from";
@@ -47,8 +47,8 @@ pub(crate) struct Args {
     data: PathBuf,
     #[command(flatten)]
     training: TrainingArgs,
-    /// Continue from the checkpoint that an earlier run left in this folder, on the same data and with the flags of that run: no other
-    /// flag is needed. A flag given here takes the place of the earlier one, such as a larger --steps or --seconds
+    /// Continue from the checkpoint that an earlier run left in this folder, on the same data and with its flags; no other flag is
+    /// needed. A flag given here replaces the earlier one, for example a larger --steps or --seconds
     #[arg(long, value_name = "FOLDER", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "count", "plan_steps"])]
     resume: Option<PathBuf>,
     /// Repeat what the clock decided in an earlier run, and get the same model: with the settings of the log that it left
@@ -119,7 +119,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
     let started = Instant::now();
     let replay = args.replay_decisions.as_deref().map(Replay::load).transpose()?;
-    training::limits(args.seconds, args.steps, USUAL_SECONDS)?; // Refused before anything is read.
+    training::limits(args.seconds, args.steps, USUAL_SECONDS)?; // Checked before anything is read.
     if let Some(out) = &args.out {
         run_folder::refuse_model(out)?;
         run_folder::refuse_data(out, &args.data)?;
@@ -237,7 +237,7 @@ fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
             .with_profile(args.profile)
             .with_decisions(decisions)
             .with_data(source.clone());
-        // What is repeated is repeated on one device: its log goes by steps.
+        // A replay runs on one device: its log counts steps.
         let session = if replay.is_none() { session.with_recovery(recovery) } else { session };
         sessions.push(match (&kinds[..], &checkpoint) {
             ([_], Some(checkpoint)) => session.going_on_after(checkpoint.seconds),
@@ -280,7 +280,7 @@ fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
     Ok(exit::after(&data.losses))
 }
 
-/// Refuses a limit in seconds that is over before training continues.
+/// Refuses a limit in seconds that has already passed when training continues.
 fn refuse_over(seconds: Option<f64>, checkpoint: &Checkpoint, whose: &str) -> Result<(), BadArgument> {
     match seconds.filter(|seconds| *seconds <= checkpoint.seconds) {
         Some(seconds) => Err(BadArgument(format!(
@@ -330,10 +330,10 @@ impl Args {
         recipes.into_iter().map(begin).collect()
     }
 
-    /// The flags that a resumed run finds in the checkpoint, beside those of the images: values by names.
+    /// The flags to store in the checkpoint, besides those of the images, by name.
     fn flags(&self, limits: Limits) -> BTreeMap<String, String> {
         let whole = |file: &PathBuf| file.canonicalize().unwrap_or_else(|_| file.clone()).display().to_string();
-        // The file is yet to be written: what has a whole path is its folder.
+        // The file does not exist yet, so it cannot be canonicalized.
         let to_write =
             |file: &PathBuf| std::path::absolute(file).unwrap_or_else(|_| file.clone()).display().to_string();
         let given = [
@@ -348,7 +348,7 @@ impl Args {
         flags.chain(self.checkpoints.flag()).collect()
     }
 
-    /// These flags, and where they are not given those of the run that is resumed.
+    /// These flags, completed by those of the earlier run.
     fn with_flags_of(&self, checkpoint: &Checkpoint) -> Self {
         let earlier = |name: &str| checkpoint.flags.get(name);
         let path = |name: &str| earlier(name).map(PathBuf::from);
@@ -366,13 +366,13 @@ impl Args {
         }
     }
 
-    /// What to type to continue the training in a folder.
+    /// The command that continues the training in a folder.
     fn resume_command(&self, folder: &Path) -> String {
         let [data, folder] = [&*self.data, folder].map(|path| quoted(&path.to_string_lossy()));
         format!("fieldrig train {data} --resume {folder}")
     }
 
-    /// Whether the run to be resumed reached its end and saved its model, and no flag asks for more.
+    /// Whether the earlier run reached its limit and saved its model, and no flag asks for more.
     fn is_finished(&self, checkpoint: &Checkpoint) -> bool {
         let asks_for_more = self.seconds.is_some()
             || self.steps.is_some()

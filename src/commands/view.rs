@@ -23,10 +23,10 @@ pub(crate) struct Args {
     /// Address of the page, as numbers [default: 127.0.0.1:7007, or a free port if that one is in use]
     #[arg(long, value_name = "ADDRESS", value_parser = address)]
     listen: Option<SocketAddr>,
-    /// Axis that points up in the model: x, y, z, -x, -y or -z; files of other programs are often -y up
+    /// Axis that points up in the model: x, y, z, -x, -y or -z; files from other programs are often -y up
     #[arg(long, value_name = "AXIS", default_value = "z", allow_hyphen_values = true, value_parser = up_axis)]
     up: Up,
-    /// Print one JSON object a line
+    /// Print one JSON object per line
     #[arg(long)]
     json: bool,
 }
@@ -47,10 +47,10 @@ fn up_axis(text: &str) -> Result<Up, String> {
 }
 
 impl Up {
-    /// The page is z up.
+    /// Rotation from the page, which is z up, to the model.
     fn model_from_page(self) -> Transform {
         let rotation = UnitQuaternion::rotation_between(&Vector3::z(), &self.0);
-        // Half a turn about any horizontal axis where the two are opposite.
+        // If the two are opposite: half a turn about any horizontal axis.
         let rotation = rotation.unwrap_or_else(|| UnitQuaternion::new(std::f64::consts::PI * Vector3::x()));
         Transform::from_parts(Translation3::identity(), rotation)
     }
@@ -60,10 +60,10 @@ impl Up {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     refuse_other_than_model(&args.model)?;
     let paths = run_folder::models_at(&args.model)?;
-    let stop = Stop::on_ctrl_c_logging("stopping; Ctrl-C again ends at once")?;
+    let stop = Stop::on_ctrl_c_logging("stopping; Ctrl-C again exits at once")?;
     let gpu = super::open_gpu()?;
     let hub = Hub::new();
-    // Before the models are loaded: an address in use is reported at once.
+    // Before the models are loaded, so that an address in use is reported at once.
     let server = start_server(args.listen, &hub)?;
 
     let model_from_page = args.up.model_from_page();
@@ -106,12 +106,12 @@ impl Args {
     }
 }
 
-/// The server at the given address, or at the default one, or if that is in use at a free port.
+/// Starts the server at the given address; without one, at the default address or, if that is in use, at a free port.
 fn start_server(listen: Option<SocketAddr>, hub: &Hub) -> Result<Server, viz::Error> {
     let usual = ServerConfig::default();
     match (listen, Server::start(listen.map_or(usual, |listen| ServerConfig { listen }), hub.clone())) {
         (None, Err(viz::Error::AddressInUse { address })) => {
-            log::info!("{address} is in use by another program; taking a free port");
+            log::info!("{address} is in use by another program; using a free port");
             let mut listen = usual.listen;
             listen.set_port(0);
             Server::start(ServerConfig { listen }, hub.clone())
@@ -120,7 +120,7 @@ fn start_server(listen: Option<SocketAddr>, hub: &Hub) -> Result<Server, viz::Er
     }
 }
 
-/// Refuses what people take for a model, and names the command that it is for.
+/// Refuses paths that are often mistaken for a model, and names the command to use instead.
 fn refuse_other_than_model(model: &Path) -> Result<(), BadArgument> {
     let shown = model.display();
     let is_url = |scheme: &str| model.to_str().is_some_and(|text| text.starts_with(scheme));
@@ -131,23 +131,23 @@ fn refuse_other_than_model(model: &Path) -> Result<(), BadArgument> {
     }
     if model.is_file() && data::is_recording(model) {
         return Err(BadArgument(format!(
-            "{shown} is a recording, not a model: `fieldrig train` makes a model of it, and `fieldrig run RIG.toml --from \
-             {shown}` shows how one grows"
+            "{shown} is a recording, not a model: train a model with `fieldrig train`, or watch one being trained with \
+             `fieldrig run RIG.toml --from {shown}`"
         )));
     }
     if drivers::dataset::is_dataset_folder(model) && run_folder::models_at(model).is_err() {
         return Err(BadArgument(format!(
-            "{shown} is a dataset, not a model: `fieldrig train {shown}` makes one of it; name the folder of that run"
+            "{shown} is a dataset, not a model: train one with `fieldrig train {shown}` and name the folder of that run"
         )));
     }
     Ok(())
 }
 
-/// The cameras of the first model whose folder lists them; a list that cannot be read is only a warning.
+/// The cameras of the first model whose folder lists them; an unreadable list only causes a warning.
 fn cameras(models: &[PathBuf]) -> Vec<KeyframePose> {
     let read = |folder: &PathBuf| {
         camera_list::read(folder).unwrap_or_else(|error| {
-            log::warn!("cameras are not shown: {error:#}");
+            log::warn!("cannot show cameras: {error:#}");
             None
         })
     };
@@ -162,7 +162,7 @@ fn in_page(cameras: Vec<KeyframePose>, model_from_page: &Transform) -> Vec<Keyfr
     cameras.into_iter().map(in_page).collect()
 }
 
-/// Where the view starts: from the first camera, else from outside the model; `None` for an empty model.
+/// The first view: from the first camera, or without cameras from outside the model; `None` for an empty model.
 fn first_view(cameras: &[KeyframePose], bounds: Option<Bounds>, model_from_page: &Transform) -> Option<SceneHint> {
     let poses = cameras.iter().map(|camera| camera.world_from_camera).collect();
     scene_hint::from_cameras(poses).or_else(|| {
@@ -172,13 +172,13 @@ fn first_view(cameras: &[KeyframePose], bounds: Option<Bounds>, model_from_page:
     })
 }
 
-/// What the report in a model's folder says; `Null` where there is none.
+/// The report in a model's folder; `Null` if there is none.
 fn report(model: &Path) -> Value {
     let text = std::fs::read_to_string(model.join("report.json")).unwrap_or_default();
     serde_json::from_str(&text).unwrap_or_default()
 }
 
-/// What a model is, and how it scored when its training ended.
+/// Size and scores of a model when its training ended.
 fn model_status(model: &Path, method: &str, progress: &Progress) -> ModelStatus {
     let report = report(model);
     let (done, marks) = (&report["done"], report["marks"].as_array());

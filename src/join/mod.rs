@@ -51,9 +51,9 @@ pub(crate) struct Join {
     default_depth_m: f64,
     /// The latest stamp of all samples: the only clock there is.
     newest: Stamp,
-    /// The latest stamp of the keyframes of the run that is resumed.
+    /// The latest stamp among the keyframes of the resumed run.
     newest_earlier: Option<Stamp>,
-    /// Nanoseconds added to the stamps of new keyframes, so that they come after the earlier ones; none before the first.
+    /// Nanoseconds added to the stamps of new keyframes so that they follow the earlier ones; none before the first keyframe.
     shift_nanos: Option<i64>,
 }
 
@@ -131,10 +131,10 @@ impl Join {
         self
     }
 
-    /// Continues a run that had these keyframes; gives those for which the store has no room any more.
+    /// Continues a run that had these keyframes; returns those for which the store has no room.
     ///
-    /// Clocks start anew with a simulation or a computer: where the first new keyframe would not come after the earlier ones, the
-    /// stamps of all new ones are shifted.
+    /// Clocks restart with a simulation or a computer. If the first new keyframe would not follow the earlier ones, the stamps of
+    /// all new keyframes are shifted.
     pub(crate) fn after(mut self, keyframes: &[Arc<Keyframe>]) -> (Self, Vec<(Arc<str>, Stamp)>) {
         let mut evicted = Vec::new();
         for keyframe in keyframes {

@@ -1,4 +1,4 @@
-//! In the place of a model whose GPU failed.
+//! Takes the place of a model whose GPU failed.
 
 use kinematics::Stamp;
 use std::path::Path;
@@ -9,7 +9,7 @@ use trainer::gpu::PassTiming;
 use trainer::splat::PosedLens;
 use trainer::{Error, Keyframe, Method, Part, Picture, Progress, RenderRequest};
 
-/// No model: every use of it is an error.
+/// No model: every operation fails.
 pub(crate) struct Absent;
 
 impl Method for Absent {

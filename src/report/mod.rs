@@ -1,6 +1,6 @@
-//! `report.html`: what a training gave, as one file that needs no network: test images beside renders, scores, settings.
+//! `report.html`: the result of a training run in one file without network access: test images beside renders, scores, settings.
 //!
-//! The page is made of `report.json`, of pictures drawn for it, and of the commands to type next.
+//! The page is made from `report.json`, from pictures drawn for it, and from the commands to run next.
 
 mod pictures;
 
@@ -18,19 +18,19 @@ use std::path::Path;
 
 /// Name of the page in the folder of a run.
 pub(crate) const FILE: &str = "report.html";
-/// Tables with more rows than this are folded.
+/// Tables with more rows than this are collapsed.
 const MAX_OPEN_ROWS: usize = 16;
 
-/// What the page shows.
+/// The content of the page.
 pub(crate) struct Page<'a> {
     pub(crate) folder: &'a Path,
-    /// As it is in `report.json`.
+    /// The content of `report.json`.
     pub(crate) report: &'a Value,
-    /// What the model is made of, in the singular.
+    /// Name of the model's primitive, in the singular.
     pub(crate) primitive: &'a str,
     pub(crate) comparisons: &'a [Comparison],
     pub(crate) next: &'a [NextCommand],
-    /// Settings of the model, as the log of decisions has them; `Null` where there is no log.
+    /// Settings of the model from the log of decisions; `Null` if there is no log.
     pub(crate) settings: Value,
     /// The command line of the training.
     pub(crate) command: String,
@@ -68,7 +68,7 @@ impl Page<'_> {
         page
     }
 
-    /// Data, length and device in one line.
+    /// Program version, data and device in one line.
     fn subtitle(&self) -> String {
         let text = |key: &str| self.report[key].as_str().map(str::to_owned);
         let words = [Some(format!("fieldrig {}", env!("CARGO_PKG_VERSION"))), text("data"), text("adapter")];
@@ -95,7 +95,7 @@ impl Page<'_> {
     }
 }
 
-/// The scores and sizes that people look for first.
+/// The main scores and sizes.
 fn figures(done: &Value, primitive: &str) -> String {
     let number = |key: &str| done[key].as_f64();
     let scaled =
@@ -118,12 +118,12 @@ fn figures(done: &Value, primitive: &str) -> String {
     for (name, value, unit) in entries {
         let Some(value) = value else { continue };
         let unit = if unit.is_empty() { String::new() } else { format!("<small>{unit}</small>") };
-        writeln!(html, "<div><dd>{value}{unit}</dd><dt>{}</dt></div>", escaped(name)).expect("a string takes all");
+        writeln!(html, "<div><dd>{value}{unit}</dd><dt>{}</dt></div>", escaped(name)).expect("a String never fails");
     }
     for (camera, psnr) in done["psnr_per_camera"].as_object().into_iter().flatten() {
         let (camera, psnr) = (escaped(camera), psnr.as_f64().unwrap_or_default());
         writeln!(html, "<div><dd>{psnr:.2}<small>dB</small></dd><dt>PSNR of {camera}</dt></div>")
-            .expect("a string takes all");
+            .expect("a String never fails");
     }
     html.push_str("</dl>\n");
     html
@@ -152,16 +152,16 @@ fn commands(next: &[NextCommand]) -> String {
 /// Test images beside renders.
 fn shots(comparisons: &[Comparison], n_tests: usize) -> String {
     if comparisons.is_empty() {
-        let why = if n_tests == 0 { "no image was held out for testing" } else { "none could be drawn" };
-        return format!("<h2>Test images</h2>\n<p class=\"legend\">There are none to show: {why}.</p>\n");
+        let why = if n_tests == 0 { "no image was held out for testing" } else { "no test image could be drawn" };
+        return format!("<h2>Test images</h2>\n<p class=\"legend\">No comparison: {why}.</p>\n");
     }
     let of_all = match comparisons.len() == n_tests {
         true => String::new(),
         false => format!("{} of {n_tests} test images, with the best and the worst among them. ", comparisons.len()),
     };
     let mut html = format!(
-        "<h2>Test images</h2>\n<p class=\"legend\">{of_all}Left the image as the camera delivered it, then the model's picture from \
-         there: no image here was trained on.</p>\n<div class=\"shots\">\n"
+        "<h2>Test images</h2>\n<p class=\"legend\">{of_all}Left the image from the camera, then the model's render from the same pose. \
+         None of these images was used for training.</p>\n<div class=\"shots\">\n"
     );
     let by_psnr = |a: &&Comparison, b: &&Comparison| a.psnr.total_cmp(&b.psnr);
     let (worst, best) = (comparisons.iter().min_by(by_psnr), comparisons.iter().max_by(by_psnr));
@@ -214,7 +214,7 @@ fn curve(report: &Value, method: &str) -> String {
     }
     let chart = Chart {
         title: "PSNR of test images over time".into(),
-        subtitle: "held-out images; the last point is the saved model".into(),
+        subtitle: "the last point is the saved model".into(),
         x: Axis {
             label: "seconds of training (log)".into(),
             scale: Scale::Log,
@@ -255,7 +255,7 @@ fn marks_table(report: &Value, primitive: &str) -> Table {
         ("n_images", "test images", 1.0, 0),
         ("primitives", primitives.as_str(), 1.0, 0),
         ("bytes", "MB", 1e-6, 1),
-        ("step_millis", "ms a step", 1.0, 2),
+        ("step_millis", "ms per step", 1.0, 2),
     ];
     table("Scores during training", &report["marks"], ("seconds", "seconds"), &columns)
 }
@@ -263,7 +263,7 @@ fn marks_table(report: &Value, primitive: &str) -> Table {
 /// A column: key, head, factor, digits after the point.
 type Column<'a> = (&'a str, &'a str, f64, usize);
 
-/// A table of objects: one row each; columns that are empty throughout are left out.
+/// A table of objects, one row each; columns without any value are left out.
 fn table(title: &str, objects: &Value, (key, head): (&str, &str), columns: &[Column<'_>]) -> Table {
     let objects = array(objects);
     let is_known = |column: &&Column<'_>| objects.iter().any(|object| object[column.0].is_number());
@@ -287,7 +287,7 @@ fn table(title: &str, objects: &Value, (key, head): (&str, &str), columns: &[Col
     }
 }
 
-/// A table, folded where it is long, and left out where it is empty.
+/// A table: collapsed if it is long, left out if it is empty.
 fn folded(table: &Table, title: &str) -> String {
     match table.rows.len() {
         0 => String::new(),
@@ -296,7 +296,7 @@ fn folded(table: &Table, title: &str) -> String {
     }
 }
 
-/// What parts of the model were found to be worth.
+/// The results of the trials of model parts.
 fn parts(parts: &Value) -> String {
     let rows: Vec<Vec<String>> = array(parts)
         .iter()
@@ -327,7 +327,7 @@ fn settings_table(title: &str, rows: Vec<Vec<String>>, is_folded: bool) -> Strin
     }
 }
 
-/// A value as rows of a table: objects have one row for each key, what is empty has none.
+/// A value as rows of a table: one row per key for objects, none for empty values.
 fn rows_of(key: &str, value: &Value) -> Vec<Vec<String>> {
     let key = match key {
         "n_train" => "training images".to_owned(),
@@ -369,7 +369,7 @@ fn text_of(value: &Value) -> String {
     }
 }
 
-/// Four digits are enough to read.
+/// A number with four digits after the point, without trailing zeros.
 fn short_float(value: f64) -> String {
     if value == 0.0 || (1e-3..1e6).contains(&value.abs()) {
         let text = format!("{value:.4}");
@@ -378,7 +378,7 @@ fn short_float(value: f64) -> String {
     format!("{value:.3e}")
 }
 
-/// A whole number in groups of three digits.
+/// A whole number with its digits in groups of three.
 fn grouped(value: f64) -> String {
     let digits = format!("{:.0}", value.abs());
     let mut text = String::from(if value < 0.0 { "-" } else { "" });
@@ -395,7 +395,7 @@ fn array(value: &Value) -> &[Value] {
     value.as_array().map_or(&[], Vec::as_slice)
 }
 
-/// The settings in a folder's log of decisions: its first line; `Null` where there is none.
+/// The settings in a folder's log of decisions, which are its first line; `Null` if there is no log.
 pub(crate) fn settings_in(folder: &Path) -> Value {
     let step_of = |name: &str| name.strip_prefix("decisions-from-")?.strip_suffix(".jsonl")?.parse::<u64>().ok();
     let names = std::fs::read_dir(folder).into_iter().flatten().flatten();
@@ -414,7 +414,7 @@ mod tests {
     use serde_json::json;
 
     fn page(report: &Value) -> String {
-        let next = NextCommand { purpose: "look at it", command: "fieldrig view 'a <b>'".into() };
+        let next = NextCommand { purpose: "view the model", command: "fieldrig view 'a <b>'".into() };
         let page = Page {
             folder: Path::new("runs/a <b>"),
             report,

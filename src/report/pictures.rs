@@ -1,4 +1,4 @@
-//! Test images beside what the model draws there, small enough to be embedded in a page.
+//! Test images beside the model's renders, small enough to be embedded in a page.
 
 use crate::evaluate;
 use crate::shrink;
@@ -9,27 +9,27 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::{Keyframe, Method, Picture};
 
-/// Most test images that are shown.
+/// Maximum number of test images shown.
 const MAX_IMAGES: usize = 12;
-/// Longest side of image and render.
+/// Maximum side of the image and the render.
 const MAX_SIDE_PX: u32 = 640;
-/// Longest side of error and depth.
+/// Maximum side of the error and depth pictures.
 const MAX_SMALL_SIDE_PX: u32 = 320;
 const QUALITY: u8 = 82;
 const SMALL_QUALITY: u8 = 75;
-/// Most bytes of all pictures together, as the page holds them.
+/// Maximum bytes of all pictures together, in the encoding of the page.
 const MAX_TEXT_BYTES: usize = 2_600_000;
-/// Drawing stops after this time: on a processor one picture of a neural field may take half a minute.
+/// Drawing stops after this time: on a processor, one picture of a neural field may take half a minute.
 const MAX_DRAWING: Duration = Duration::from_secs(10);
-/// Difference of a color that is drawn brightest, in 255ths.
+/// Color difference that is drawn brightest, of 255.
 const MAX_ERROR: u8 = 64;
 
-/// One test image and the model's picture of it.
+/// One test image and the model's render of it.
 pub(crate) struct Comparison {
     pub(crate) name: String,
     pub(crate) psnr: f64,
     pub(crate) ssim: Option<f64>,
-    /// In CSS pixels of the larger pictures.
+    /// Size of the larger pictures in CSS pixels.
     pub(super) size_px: [u32; 2],
     pub(super) image: String,
     pub(super) render: String,
@@ -37,10 +37,10 @@ pub(crate) struct Comparison {
     pub(super) depth: Option<DepthPicture>,
 }
 
-/// Depth of a render in colors.
+/// Depth of a render in false color.
 pub(super) struct DepthPicture {
     pub(super) picture: String,
-    /// What the ends of the colors stand for, meters.
+    /// Depth at the two ends of the color scale, meters.
     pub(super) range_m: [f32; 2],
 }
 
@@ -52,7 +52,7 @@ pub(crate) struct Scored<'a> {
     pub(crate) ssim: Option<f64>,
 }
 
-/// Draws test images spread over all, with the best and the worst among them; in the order of `scored`.
+/// Draws test images spread over all of them, including the best and the worst, in the order of `scored`.
 pub(crate) fn compare(method: &mut dyn Method, scored: &[Scored<'_>]) -> anyhow::Result<Vec<Comparison>> {
     let begun = Instant::now();
     let mut comparisons: Vec<(usize, Comparison)> = Vec::new();
@@ -73,12 +73,12 @@ pub(crate) fn compare(method: &mut dyn Method, scored: &[Scored<'_>]) -> anyhow:
     Ok(comparisons.into_iter().map(|(_, comparison)| comparison).collect())
 }
 
-/// Which images to show, the most telling first: the worst, the best, and others evenly spread.
+/// Indices of the images to show, the most important first: the worst, the best, and others evenly spread.
 fn chosen(psnr: &[f64]) -> Vec<usize> {
     let by_psnr = |a: &usize, b: &usize| psnr[*a].total_cmp(&psnr[*b]);
     let mut chosen: Vec<usize> = (0..psnr.len()).min_by(by_psnr).into_iter().collect();
     let n_spread = MAX_IMAGES.saturating_sub(2).max(1);
-    // Neighbors come late, so that the images are spread over all wherever drawing stops.
+    // Neighbors come late, so that the images are spread over all of them wherever drawing stops.
     let mut spread: Vec<usize> = (0..n_spread).collect();
     spread.sort_by_key(|n| n.reverse_bits());
     let spread = spread.into_iter().map(|n| n * psnr.len() / n_spread);
@@ -118,7 +118,7 @@ impl Comparison {
 }
 
 impl DepthPicture {
-    /// `None` where nothing was drawn.
+    /// `None` if nothing was drawn.
     fn of(picture: &Picture, size_px: [u32; 2]) -> anyhow::Result<Option<Self>> {
         let thin = nearest_pixels(&picture.depth_m, picture.size_px, size_px);
         let mut known: Vec<f32> = thin.iter().copied().filter(|z| *z > 0.0 && z.is_finite()).collect();
@@ -134,7 +134,7 @@ impl DepthPicture {
     }
 }
 
-/// The largest size of these proportions with sides of at most `max_side_px`.
+/// The largest size with the same aspect ratio and sides of at most `max_side_px`.
 fn fitted(size_px: [u32; 2], max_side_px: u32) -> [u32; 2] {
     let longest = size_px[0].max(size_px[1]).max(1);
     if longest <= max_side_px {
@@ -149,7 +149,7 @@ fn opaque(rgba: &[u8]) -> Vec<u8> {
     rgba.as_chunks::<4>().0.iter().flat_map(|[r, g, b, _]| [*r, *g, *b, 255]).collect()
 }
 
-/// Colors of `rgba`; black where the image has no pixel.
+/// Colors of `rgba`; black where the image is masked.
 fn shown_where(rgba: &[u8], image: &[u8]) -> Vec<u8> {
     let pixels = rgba.as_chunks::<4>().0.iter().zip(image.as_chunks::<4>().0);
     pixels.flat_map(|([r, g, b, _], [.., alpha])| if *alpha > 0 { [*r, *g, *b] } else { [0; 3] }).collect()
@@ -159,7 +159,7 @@ fn rgb(rgba: &[u8]) -> Vec<u8> {
     shown_where(rgba, rgba)
 }
 
-/// The largest difference of a pixel's colors, from black over red to light yellow; black where the image has no pixel.
+/// The largest channel difference of each pixel, from black over red to light yellow; black where the image is masked.
 fn errors(render: &[u8], image: &[u8]) -> Vec<u8> {
     let pixels = render.as_chunks::<4>().0.iter().zip(image.as_chunks::<4>().0);
     let error = |(render, image): (&[u8; 4], &[u8; 4])| {
@@ -169,7 +169,7 @@ fn errors(render: &[u8], image: &[u8]) -> Vec<u8> {
     pixels.flat_map(error).collect()
 }
 
-/// Colors of rising brightness: black, purple, red, orange, light yellow, evenly spaced.
+/// A color map of rising brightness: black, purple, red, orange, light yellow, evenly spaced.
 fn heat(share: f32) -> [u8; 3] {
     const STOPS: [[f32; 3]; 5] =
         [[0.0, 0.0, 4.0], [87.0, 16.0, 110.0], [188.0, 55.0, 84.0], [249.0, 142.0, 9.0], [252.0, 255.0, 164.0]];
@@ -180,7 +180,7 @@ fn heat(share: f32) -> [u8; 3] {
     std::array::from_fn(|channel| byte(STOPS[ix][channel] + frac * (STOPS[ix + 1][channel] - STOPS[ix][channel])))
 }
 
-/// Near is red, far is blue: Mikhailov 2019, "Turbo, an improved rainbow colormap", its polynomial, reversed.
+/// Color map from red (near) to blue (far): the polynomial of Mikhailov 2019, "Turbo, an improved rainbow colormap", reversed.
 fn turbo(share: f32) -> [u8; 3] {
     const RED: [f32; 6] = [0.135_721_4, 4.615_392_6, -42.660_32, 132.131_08, -152.942_4, 59.286_38];
     const GREEN: [f32; 6] = [0.091_402_61, 2.194_188_4, 4.842_966_6, -14.185_033, 4.277_298_5, 2.829_566];
@@ -194,7 +194,7 @@ fn byte(value: f32) -> u8 {
     value.round().clamp(0.0, 255.0) as u8
 }
 
-/// The values at the centers of the pixels of a smaller picture: means of depth lie where nothing is.
+/// Samples the values at the pixel centers of a smaller picture. Averages of depth would lie on no surface.
 fn nearest_pixels(values: &[f32], from_px: [u32; 2], to_px: [u32; 2]) -> Vec<f32> {
     let place = |ix: u32, from: u32, to: u32| (2 * ix as usize + 1) * from as usize / (2 * to as usize);
     let mut thin = Vec::with_capacity(to_px[0] as usize * to_px[1] as usize);
@@ -205,11 +205,11 @@ fn nearest_pixels(values: &[f32], from_px: [u32; 2], to_px: [u32; 2]) -> Vec<f32
     thin
 }
 
-/// A JPEG as the address of an `<img>`.
+/// A JPEG as a data URI for `<img>`.
 fn data_uri(rgb: &[u8], [width, height]: [u32; 2], quality: u8) -> anyhow::Result<String> {
     let mut bytes = Vec::new();
     let mut encoder = JpegEncoder::new_with_quality(&mut bytes, quality);
-    encoder.encode(rgb, width, height, ExtendedColorType::Rgb8).context("a picture cannot be encoded as JPEG")?;
+    encoder.encode(rgb, width, height, ExtendedColorType::Rgb8).context("cannot encode a picture as JPEG")?;
     let mut uri = String::from("data:image/jpeg;base64,");
     write_base64(&bytes, &mut uri);
     Ok(uri)

@@ -1,4 +1,4 @@
-//! Marks that are scored image by image are those that are scored at once.
+//! Scoring image by image gives the same result as scoring at once.
 
 use super::*;
 use kinematics::{Stamp, Transform};
@@ -11,7 +11,7 @@ const SIZE_PX: [u32; 2] = [4, 2];
 const N_TESTS: u8 = 5;
 const MAX_AT_MARKS: usize = 3;
 
-/// A model whose pictures have one gray level, and which counts what it is asked for.
+/// A model that draws pictures of one gray level and counts them.
 #[derive(Default)]
 struct Gray {
     level: u8,
@@ -109,7 +109,7 @@ fn test_keyframe(ix: u8) -> Arc<Keyframe> {
     })
 }
 
-/// A session of a second that has a mark to report, and the counter of its pictures.
+/// A session of one second with an evaluation due, and the counter of its pictures.
 fn at_a_mark(stop: &Stop) -> (Session, std::rc::Rc<std::cell::Cell<u32>>) {
     let method = Gray::default();
     let n_drawn = method.n_drawn.clone();
@@ -147,7 +147,7 @@ fn a_mark_is_scored_image_by_image_and_gives_the_scores_of_one_scored_at_once() 
     assert_eq!((one.n_images, one.step), (3, 1));
     assert_eq!((other.n_images, other.step), (3, 1));
     assert!(one.scores == other.scores && one.scores.psnr.is_some());
-    assert!((other.seconds - 1.0).abs() < 0.9, "{} s: when the mark was reached", other.seconds);
+    assert!((other.seconds - 1.0).abs() < 0.9, "{} s: when the evaluation was due", other.seconds);
     assert!(stepwise.psnr() == at_once.psnr());
     stepwise.score_next().expect("nothing to do");
     assert_eq!((stepwise.told.len(), n_drawn.get()), (1, 3));

@@ -85,7 +85,7 @@ fn run_inside(more: &[&str], boot: impl FnOnce() -> String) {
     let is_demanded = std::env::var(DEMAND).is_ok_and(|value| value == "demand");
     if let Some(why) = missing(more) {
         assert!(!is_demanded, "{DEMAND}=demand, but {why}");
-        // Past the test harness, which hides what passing tests print.
+        // Bypasses the test harness, which hides the output of passing tests.
         let _ = writeln!(std::io::stderr(), "skipped: {why}");
         return;
     }
@@ -104,7 +104,7 @@ fn missing(more: &[&str]) -> Option<String> {
     if !is_bookworm || !cfg!(target_arch = "x86_64") {
         return Some("the virtual kernels are built of Debian 12's source, on x86-64 only".into());
     }
-    // Every file that only a package of the group `hil` provides: half of them would fail in the kernel's build.
+    // All files that only packages of the group `hil` provide: with only some of them, the kernel's build would fail.
     let needed = [
         "/usr/src/linux-source-6.1.tar.xz",
         "/usr/bin/busybox",

@@ -1,11 +1,11 @@
-//! Few and small photos with poses, to train on for a moment.
+//! A few small photos with poses, for short training runs.
 
 use serde_json::json;
 use std::path::Path;
 
 const SIZE_PX: [u32; 2] = [64, 48];
 
-/// Ten photos of a patterned wall, taken from places in a row.
+/// Ten photos of a patterned wall, taken from positions in a row.
 pub(crate) fn dataset(folder: &Path) {
     std::fs::create_dir_all(folder).expect("room on the disk");
     let mut frames = Vec::new();

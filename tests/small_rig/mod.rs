@@ -1,29 +1,29 @@
-//! A small simulated rig for tests of the whole program.
+//! A small simulated rig for end-to-end tests.
 #![cfg(feature = "sim")]
 #![allow(dead_code, reason = "each test uses a part of it")]
 
 use std::path::Path;
 
-/// How many times smaller than in the shipped rig file its images are along each side.
+/// Factor by which its images are smaller than in the shipped rig file, along each side.
 const SMALLER: i64 = 4;
 
-/// How its time passes.
+/// Pace of the simulation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Pace {
-    /// Samples are computed when they are asked for.
+    /// Samples are computed when they are requested.
     Lockstep,
-    /// As with real devices.
+    /// Samples arrive in real time, as from devices.
     RealTime,
 }
 
-/// Writes `rig.toml` into a folder: `rigs/static-arm.toml` at a quarter of its size, without flaws, and what it names.
+/// Writes `rig.toml` into a folder: `rigs/static-arm.toml` at a quarter of its image size, without flaws, and the files it names.
 pub(crate) fn write(folder: &Path, pace: Pace) {
     write_with(folder, |sim| {
         sim.insert("lockstep".into(), (pace == Pace::Lockstep).into());
     });
 }
 
-/// As [`write`], with a change of the table `[sim]`.
+/// Same as [`write`], but changes the table `[sim]` first.
 pub(crate) fn write_with(folder: &Path, change: impl FnOnce(&mut toml::Table)) {
     let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
     let text = std::fs::read_to_string(rigs.join("static-arm.toml")).expect("a shipped rig file");

@@ -26,9 +26,9 @@ pub struct Checkpoint {
     pub seconds: f64,
     /// SHA-256 of the model that keyframes without depth had theirs drawn from, where there was one.
     pub depth_from: Option<String>,
-    /// Flags of the run, for its caller to continue with them: values by names. The limit where training ends is among them.
+    /// Flags of the run by name, for its caller to continue with them. They include the limit of training.
     pub flags: BTreeMap<String, String>,
-    /// Whether training had reached its end.
+    /// Whether training had reached its limit.
     pub is_finished: bool,
     /// The method's state but for its arrays.
     pub state: serde_json::Value,

@@ -31,7 +31,7 @@ pub enum Error {
     /// The GPU stopped answering.
     #[error("the GPU stopped answering: its driver reset or lost the device")]
     DeviceLost,
-    /// The GPU has no memory left for a buffer; without a name and a size, for commands or a transfer.
+    /// The GPU has no memory left for a buffer, or for commands or a transfer; these have no name and no size.
     #[error(
         "the GPU ran out of memory{}; close other programs that use it, or lower --max-splats, --max-bytes or the image size",
         of_buffer(label, *bytes)
@@ -39,10 +39,10 @@ pub enum Error {
     OutOfMemory {
         /// Name of the buffer.
         label: String,
-        /// Bytes wanted.
+        /// Requested size, bytes.
         bytes: u64,
     },
-    /// The GPU rejected a command: a bug of ours or of its driver.
+    /// The GPU rejected a command, because of a bug in this program or in the driver.
     #[error("the GPU rejected a command: {0}")]
     Rejected(String),
     /// A buffer past the adapter's limit.
@@ -188,12 +188,12 @@ pub enum Error {
 }
 
 impl Error {
-    /// Whether it is the GPU that failed: on another device the same work may succeed.
+    /// Whether the GPU caused the error: on another device the same work may succeed.
     pub fn is_of_gpu(&self) -> bool {
         matches!(self, Self::DeviceLost | Self::OutOfMemory { .. } | Self::Rejected(_))
     }
 
-    /// Whether there is no memory for a buffer as large as was asked for.
+    /// Whether there is no memory for a buffer of the requested size.
     pub(crate) fn is_of_memory(&self) -> bool {
         matches!(self, Self::OutOfMemory { .. } | Self::BufferTooLarge { .. })
     }

@@ -69,7 +69,7 @@ impl Keyframe {
         })
     }
 
-    /// Host memory of its arrays.
+    /// Host memory of the arrays.
     pub fn bytes(&self) -> u64 {
         let depth = self.depth.as_ref().map_or(0, |depth| size_of_val(&*depth.depth_m));
         let truth = self.truth.as_ref().map_or(0, |truth| truth.rgba_srgb.len());

@@ -37,12 +37,12 @@ pub struct Part {
     pub kept: bool,
 }
 
-/// GPU time a submit of training may hold, so that checkpoints, keyframes and Ctrl-C get their turn.
+/// Maximum GPU time of a training submit, short enough for checkpoints, keyframes and Ctrl-C to get their turn.
 const SUBMIT_MILLIS: f64 = 20.0;
-/// The same while pictures are asked for: a picture waits for one submit that runs and one that is queued.
+/// The same while pictures are requested: a picture waits for one running submit and one queued submit.
 const SUBMIT_MILLIS_WATCHED: f64 = 4.0;
 
-/// GPU time a submit of training may hold, milliseconds.
+/// Maximum GPU time of a training submit, milliseconds.
 pub(crate) fn submit_millis(watched: bool) -> f64 {
     if watched { SUBMIT_MILLIS_WATCHED } else { SUBMIT_MILLIS }
 }
@@ -55,8 +55,8 @@ pub trait Method {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error>;
     /// Forgets the keyframe of this camera and stamp, if it is held.
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error>;
-    /// Queues at most `n` optimiser updates, few enough to hold the GPU for no more than 20 ms ([`Method::set_watched`]: 4 ms),
-    /// and says how many. At most one submit runs and one is queued.
+    /// Queues at most `n` optimizer updates, few enough to hold the GPU for no more than 20 ms ([`Method::set_watched`]: 4 ms),
+    /// and returns how many. At most one submit runs and one is queued.
     ///
     /// A queued update is lost, and done again later, when it turns out that a buffer was too small. When all `n` were
     /// queued the call waits for them, so that [`Method::progress`] is exact; loop until it has reached the step you want.
@@ -72,13 +72,13 @@ pub trait Method {
     fn seed(&mut self) -> Result<(), Error>;
     /// Waits until everything that learning needs is compiled; [`Method::step`] would wait for it otherwise.
     fn prepare(&mut self) -> Result<(), Error>;
-    /// Sets whether pictures are asked for while it learns: submits are shorter then, and no bit of what is learned differs.
+    /// Sets whether pictures are requested during training: submits are shorter then, but the learned parameters are bit-identical.
     fn set_watched(&mut self, watched: bool);
     /// Draws a picture; works from the first keyframe on.
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error>;
-    /// PSNR of the picture of a request against the image of a keyframe of its size, dB, without reading the picture back:
-    /// the same number to the last bit as [`crate::eval::psnr`] of the picture, which has 8 bits too. `None` where the model
-    /// cannot compare on the GPU, or not yet.
+    /// PSNR of the requested picture against a keyframe's image of the same size, dB, without reading the picture back. The same
+    /// bits as [`crate::eval::psnr`] of the picture, which also has 8 bits. `None` if the model cannot compare on the GPU, or not
+    /// yet.
     fn psnr(&mut self, _request: &RenderRequest, _keyframe: &Keyframe) -> Result<Option<f64>, Error> {
         Ok(None)
     }

@@ -60,7 +60,7 @@ pub struct RenderRequest {
     /// In the light and with the exposure that this camera had at this time, where the model knows them; `None`: in those of the
     /// mean image.
     pub light_of: Option<(Arc<str>, Stamp)>,
-    /// Whether depth is wanted. Without it [`Picture::depth_m`] is empty, and half as many bytes are read back from the GPU.
+    /// Whether depth is requested. Without it [`Picture::depth_m`] is empty, and half as many bytes are read back from the GPU.
     pub depth: bool,
 }
 
@@ -71,13 +71,13 @@ pub struct Picture {
     pub size_px: [u32; 2],
     /// `[height, width, 4]`, sRGB over the background; alpha is coverage.
     pub rgba_srgb: Vec<u8>,
-    /// `[height, width]`, metres along z (distance for equirectangular); 0 where nothing is. Empty where [`RenderRequest::depth`]
-    /// was false.
+    /// `[height, width]`, meters along z (distance for equirectangular); 0 where nothing is. Empty without
+    /// [`RenderRequest::depth`].
     pub depth_m: Vec<f32>,
 }
 
 impl Picture {
-    /// What to read back for a picture that was drawn into these buffers; the depths where they are wanted.
+    /// The buffers to read back for a picture drawn into them; the depths only if requested.
     pub(crate) fn buffers<'a>(
         size_px: [u32; 2],
         pixels: &'a Buffer,
@@ -87,7 +87,7 @@ impl Picture {
         std::iter::once(pixels).chain(depths).map(|buffer| (buffer, n_bytes)).collect()
     }
 
-    /// The picture from what was read back of [`Self::buffers`].
+    /// The picture made from the data read back from [`Self::buffers`].
     pub(crate) fn of_parts(size_px: [u32; 2], parts: &[&[u8]]) -> Self {
         let depth_m = parts.get(1).map_or(Vec::new(), |bytes| bytemuck::pod_collect_to_vec(bytes));
         Self { size_px, rgba_srgb: parts[0].to_vec(), depth_m }

@@ -1,35 +1,35 @@
-//! Files that are whole or not there.
+//! Writes files so that they are either complete or absent.
 
 use crate::Error;
 use std::fs::File;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-/// The name that a file has while it is written: `.part` follows its own.
+/// The name of a file while it is written: its own with the suffix `.part`.
 pub fn partial_path(path: &Path) -> PathBuf {
     let mut partial = path.as_os_str().to_owned();
     partial.push(".part");
     partial.into()
 }
 
-/// Writes a file beside its place, waits until the disk has it, and moves it there: whatever happens, either the previous file or
-/// this one is under the name, whole. A partial file is removed after an error.
+/// Writes a file under a temporary name, syncs it, and renames it: whatever happens, the name refers to the complete previous
+/// file or the complete new one. A partial file is removed after an error.
 pub(crate) fn write(path: &Path, contents: impl FnOnce(&mut File) -> std::io::Result<()>) -> Result<(), Error> {
     let partial = partial_path(path);
     let written = File::create(&partial).and_then(|mut file| {
         contents(&mut file)?;
         file.sync_all()?;
         std::fs::rename(&partial, path)?;
-        // The new name is on the disk only when its folder is.
+        // The rename is durable only after the folder is synced.
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
         match File::open(folder)?.sync_all() {
-            // Some file systems, such as those of networks, cannot sync folders.
+            // Some network file systems cannot sync folders.
             Err(error) if matches!(error.kind(), ErrorKind::InvalidInput | ErrorKind::Unsupported) => Ok(()),
             synced => synced,
         }
     });
     if written.is_err() {
-        let _ = std::fs::remove_file(&partial); // It is of no use, and others may need its room.
+        let _ = std::fs::remove_file(&partial); // Incomplete, and it takes space.
     }
     written.map_err(|source| Error::Write { path: path.to_owned(), source })
 }

@@ -1,7 +1,7 @@
-//! Which connections may stay open: few enough to leave file descriptors for everything else, and those that are used.
+//! Limits open connections: file descriptors must remain for everything else, and connections in use must stay open.
 //!
-//! All peers have a loopback address, so nothing but their behavior separates a viewer from a socket that is only open.
-//! Where a limit is reached, the connection that does least gives way to the new one.
+//! All peers have loopback addresses, so only their behavior separates a viewer from an idle socket.
+//! At a limit, a new connection replaces the least active one.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -12,11 +12,11 @@ use std::time::{Duration, Instant};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::TcpStream;
 
-/// Open connections, where the limit on open files does not ask for fewer.
+/// Maximum number of open connections; lower if the limit on open files requires it.
 const MAX_CONNECTIONS: usize = 256;
 /// WebSocket clients at a time.
 const MAX_CLIENTS: usize = 32;
-/// Connections take at most this share of the files that the process may open.
+/// Connections use at most this fraction of the files that the process may open.
 const DESCRIPTOR_SHARE: usize = 4;
 /// A connection whose peer takes no byte for this long is closed.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
@@ -24,9 +24,9 @@ const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
 const IDLE_TIMEOUT: Duration = Duration::from_secs(10);
 /// A client that answers no ping for this long is disconnected.
 const PONG_TIMEOUT: Duration = Duration::from_secs(8);
-/// A client that has not answered a ping for this long gives up its seat to a new one.
+/// A client that has not answered a ping for this long may be replaced by a new one.
 const UNRESPONSIVE_AFTER: Duration = Duration::from_secs(1);
-/// A client that has sent no message for this long gives up its seat to a new one; the page sends two a second.
+/// A client that has sent no message for this long may be replaced by a new one; the page sends two a second.
 const IDLE_CLIENT_AFTER: Duration = Duration::from_secs(3);
 
 /// How many connections there may be.
@@ -88,27 +88,27 @@ struct State {
     is_closed: bool,
     reader: Option<Waker>,
     writer: Option<Waker>,
-    /// Since when a write has been waiting for the peer to read.
+    /// Since when a write has been blocked because the peer does not read.
     blocked_since: Option<Instant>,
     /// When the last request was complete; `None` before the first.
     requested: Option<Instant>,
     opened: Instant,
-    /// Set once it has a WebSocket client's seat.
+    /// Set once the connection is accepted as a WebSocket client.
     client: Option<Client>,
 }
 
 #[derive(Debug)]
 struct Client {
     seated: Instant,
-    /// When it sent its last message; pongs do not count, any library sends them.
+    /// When it sent its last message. Pongs do not count, because libraries send them on their own.
     spoke: Option<Instant>,
-    /// When a ping was sent that it has not answered.
+    /// When the ping was sent that it has not answered yet.
     pinged: Option<Instant>,
-    /// Whether it has ever answered one, which shows that it reads.
+    /// Whether it has ever answered a ping, which shows that it reads.
     has_answered: bool,
 }
 
-/// How dispensable a client is: unresponsive before never in use before idle, then the longest.
+/// How dispensable a client is: unresponsive before never used before idle, then by time.
 type Dispensability = (u8, Duration);
 
 impl Admission {
@@ -128,7 +128,7 @@ impl Admission {
         (GuardedStream { stream, connection, admission: Arc::clone(self) }, has_evicted)
     }
 
-    /// Closes the connection without a client that has been of no use for longest; half-open requests come first.
+    /// Closes the connection that has been unused for longest and has no client; half-open requests come first.
     pub(crate) fn evict(&self) -> bool {
         let registry = self.registry();
         let candidates = registry.connections.values().filter_map(|connection| {
@@ -137,12 +137,12 @@ impl Admission {
             is_candidate.then_some((state.requested.is_some(), state.requested.unwrap_or(state.opened), connection))
         });
         let oldest = candidates.min_by_key(|(has_requested, since, _)| (*has_requested, *since));
-        oldest.inspect(|(.., connection)| connection.close("its place is needed")).is_some()
+        oldest.inspect(|(.., connection)| connection.close("a new connection replaces it")).is_some()
     }
 
-    /// Seats a WebSocket client on its connection. Where all seats are taken, the most dispensable client loses its own.
+    /// Registers a WebSocket client on its connection. At the limit, it replaces the most dispensable client.
     pub(crate) fn seat(&self, connection: &Connection) -> bool {
-        // Held until the seat is taken, so that two clients never count the same seat.
+        // Held until the client is registered, so that two clients never count the same free place.
         let registry = self.registry();
         let now = Instant::now();
         let seated = registry.connections.values().filter(|other| other.has_seat());
@@ -157,13 +157,13 @@ impl Admission {
         }
         if n_seated >= self.limits.clients {
             let Some((_, other)) = worst else { return false };
-            other.close("a new client needs its seat");
+            other.close("a new client replaces it");
         }
         connection.state().client = Some(Client { seated: now, spoke: None, pinged: None, has_answered: false });
         true
     }
 
-    /// Closes connections whose peers have stopped to read, to ask or to answer.
+    /// Closes connections whose peers have stopped reading, requesting or answering.
     pub(crate) fn sweep(&self) {
         let now = Instant::now();
         for connection in self.registry().connections.values() {
@@ -173,13 +173,13 @@ impl Admission {
         }
     }
 
-    /// How many connections are open.
+    /// Number of open connections.
     #[cfg(test)]
     fn n_open(&self) -> usize {
         self.registry().connections.len()
     }
 
-    /// The registry holds plain values that are valid after every statement, so a panic elsewhere spoils nothing.
+    /// The registry holds plain values that are valid after every statement, so it stays usable after a panic elsewhere.
     fn registry(&self) -> MutexGuard<'_, Registry> {
         self.registry.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -199,7 +199,7 @@ impl Connection {
         Self { number, state: Mutex::new(state) }
     }
 
-    /// A request has arrived completely.
+    /// A complete request has arrived.
     pub(crate) fn requested(&self) {
         self.state().requested = Some(Instant::now());
     }
@@ -211,7 +211,7 @@ impl Connection {
         }
     }
 
-    /// Whether a ping is due: at most one waits for its answer.
+    /// Whether a ping is due: at most one is unanswered at a time.
     pub(crate) fn take_ping(&self) -> bool {
         match &mut self.state().client {
             Some(client) if client.pinged.is_none() => {
@@ -250,7 +250,7 @@ impl Connection {
         }
     }
 
-    /// Why the connection is to be closed now, if it is.
+    /// The reason to close the connection now, if there is one.
     fn overdue(&self, now: Instant) -> Option<&'static str> {
         let state = self.state();
         let is_over = |since: Option<Instant>, timeout| since.is_some_and(|since| now - since > timeout);
@@ -266,7 +266,7 @@ impl Connection {
         }
     }
 
-    /// Makes all reads and writes fail, so that whoever serves the connection drops it.
+    /// Makes all reads and writes fail, so that the task that serves the connection drops it.
     fn close(&self, reason: &str) {
         let mut state = self.state();
         if state.is_closed {
@@ -285,7 +285,7 @@ impl Connection {
     }
 }
 
-/// A TCP stream that [`Admission`] can close, and that leaves it when dropped.
+/// A TCP stream that [`Admission`] can close; dropping it removes it from the [`Admission`].
 #[derive(Debug)]
 pub(crate) struct GuardedStream {
     stream: TcpStream,
@@ -299,7 +299,7 @@ impl GuardedStream {
         &self.connection
     }
 
-    /// Runs a write unless the connection is closed, and notes whether the peer reads.
+    /// Runs a write unless the connection is closed, and records whether the peer reads.
     fn write(
         &mut self,
         context: &mut Context<'_>,
@@ -368,7 +368,7 @@ impl AsyncWrite for GuardedStream {
 impl Drop for GuardedStream {
     fn drop(&mut self) {
         if self.connection.state().is_closed {
-            // What the peer did not read is discarded, else the kernel would keep it for minutes.
+            // Unread data is discarded; otherwise the kernel would keep it for minutes.
             if let Err(error) = self.stream.set_zero_linger() {
                 log::debug!("cannot discard unread bytes: {error}");
             }
@@ -387,7 +387,7 @@ mod tests {
 
     const LIMITS: Limits = Limits { connections: 4, clients: 2 };
 
-    /// Admission, and a port where both ends of connections are made.
+    /// An admission, and a port at which both ends of connections are made.
     struct Port {
         admission: Arc<Admission>,
         listener: std::net::TcpListener,
@@ -447,7 +447,7 @@ mod tests {
             let (_newest, _d) = port.connect();
             let (_one_more, _e) = port.connect();
             assert!(is_closed(&half_open) && !is_closed(&served));
-            assert!(half_open.read_u8().await.is_err(), "whoever serves it sees the end");
+            assert!(half_open.read_u8().await.is_err(), "the serving task sees the end");
             drop(half_open);
             assert_eq!(port.admission.n_open(), 4);
         });
@@ -464,7 +464,7 @@ mod tests {
                 assert!(port.admission.seat(stream.connection()));
                 use_client(stream);
             }
-            assert!(!port.admission.seat(c.connection()), "both are in use");
+            assert!(!port.admission.seat(c.connection()), "both clients are in use");
             drop(a);
             assert!(port.admission.seat(c.connection()));
             assert!(!is_closed(&b));
@@ -481,7 +481,7 @@ mod tests {
             assert!(port.admission.seat(speaking.connection()) && port.admission.seat(other.connection()));
             use_client(&speaking);
             other.connection().spoke(); // It does not read.
-            assert!(port.admission.seat(newcomer.connection()), "the other never answered a ping");
+            assert!(port.admission.seat(newcomer.connection()), "the other client never answered a ping");
             assert!(is_closed(&other) && !is_closed(&speaking));
 
             let now = Instant::now();

@@ -1,4 +1,4 @@
-//! Encodes what is new once for all clients, away from their sessions.
+//! Encodes new data once for all clients, outside their sessions.
 
 use crate::Hub;
 use crate::clock::ServerClock;
@@ -12,11 +12,11 @@ use std::time::{Duration, Instant};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
-/// How often the hub is checked for something new.
+/// How often the hub is checked for new data.
 const CHECK_PERIOD: Duration = Duration::from_millis(20);
-/// A status goes out at most this often, and so do the images of a camera.
+/// A status is sent at most this often, and so is the image of each camera.
 const NEWS_PERIOD: Duration = Duration::from_millis(190);
-/// The list of keyframes goes out at most this often: it is long, and it is sent whole.
+/// The list of keyframes is sent at most this often, because it is long and always sent in full.
 const KEYFRAMES_PERIOD: Duration = Duration::from_secs(1);
 
 /// The latest encoded message of each kind.
@@ -45,7 +45,7 @@ pub(crate) struct Received {
 }
 
 impl Bulletin {
-    /// The next message that a client has not received: short ones first, and only those unless `long` ones may go too.
+    /// The next message that a client has not received: short messages first, and live images and keyframes only if `long`.
     pub(crate) fn next(&self, received: &mut Received, long: bool) -> Option<Message> {
         let newer = |item: &Option<Item>, number: &mut u64| {
             let item = item.as_ref().filter(|item| item.number > *number)?;
@@ -56,7 +56,7 @@ impl Bulletin {
         if short.is_some() || !long {
             return short;
         }
-        // The camera whose last image went out first comes first.
+        // The camera whose last image was sent longest ago comes first.
         let number_of = |camera: &Arc<str>| received.live_images.get(camera).copied().unwrap_or(0);
         let waiting = self.live_images.iter().filter(|(camera, item)| item.number > number_of(camera));
         let image = waiting.min_by_key(|(camera, _)| number_of(camera));
@@ -72,24 +72,24 @@ impl Bulletin {
     }
 }
 
-/// What a finished encoding is of.
+/// The result of a finished encoding task.
 enum Encoded {
     Keyframes(Message),
     LiveImage(Arc<str>, Message),
 }
 
-/// The image of a camera that was encoded last, or is being encoded.
+/// The image of a camera that is being encoded or was encoded last.
 struct Begun {
     image: Arc<LiveImage>,
     at: Instant,
     is_running: bool,
 }
 
-/// Encodes news while there are clients; runs until the server stops.
+/// Encodes new data while there are clients; runs until the server stops.
 pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, bulletin: watch::Sender<Bulletin>) {
     let (mut scene, mut status, mut keyframes, live_images) =
         (hub.scene(), hub.status(), hub.keyframes(), hub.live_images());
-    // A client may come before the first check, and what was set earlier is new to it.
+    // A client may connect before the first check, and it has not seen what was set earlier.
     scene.mark_changed();
     status.mark_changed();
     keyframes.mark_changed();
@@ -122,8 +122,8 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, bulletin: watch::Sen
                     });
                 }
                 Err(error) => {
-                    log::error!("encoding news failed: {error}");
-                    // It is not known of what: everything may be encoded again when it changes.
+                    log::error!("cannot encode a message for clients: {error}");
+                    // Which one is unknown: everything may be encoded again when it changes.
                     is_encoding_keyframes = false;
                     begun.values_mut().for_each(|begun| begun.is_running = false);
                 }
@@ -133,7 +133,7 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, bulletin: watch::Sen
             if !bulletin.borrow().is_empty() {
                 bulletin.send_replace(Bulletin::default());
             }
-            // The next client gets everything.
+            // The next client receives everything.
             scene.mark_changed();
             status.mark_changed();
             keyframes.mark_changed();
@@ -195,12 +195,12 @@ fn text(message: &ServerMessage<'_>) -> Message {
     Message::text(message.to_json())
 }
 
-/// The value, if it changed since the last call. An error would mean that the hub is gone, which outlives the server.
+/// The value, if it changed since the last call. An error would mean that the hub is gone, but the hub outlives the server.
 fn fresh<T: Clone>(receiver: &mut watch::Receiver<T>) -> Option<T> {
     receiver.has_changed().unwrap_or(false).then(|| receiver.borrow_and_update().clone())
 }
 
-/// Lets something happen at most once a period.
+/// Allows an event at most once per period.
 struct Throttle {
     period: Duration,
     last: Option<Instant>,
@@ -245,7 +245,7 @@ mod tests {
         let mut received = Received::default();
         assert_eq!(next(&bulletin, &mut received, false).as_deref(), Some("1"));
         assert_eq!(next(&bulletin, &mut received, false).as_deref(), Some("4"));
-        assert_eq!(next(&bulletin, &mut received, false), None, "only long ones are left");
+        assert_eq!(next(&bulletin, &mut received, false), None, "only long messages are left");
         assert_eq!(next(&bulletin, &mut received, true).as_deref(), Some("3"));
         bulletin.live_images.insert("left".into(), item(6));
         assert_eq!(next(&bulletin, &mut received, true).as_deref(), Some("5"), "the other camera's turn");

@@ -1,4 +1,4 @@
-//! The clock that a server's messages are on.
+//! The server's clock, which stamps its messages.
 
 use std::time::Instant;
 
@@ -9,17 +9,17 @@ pub(crate) struct ServerClock {
 }
 
 impl ServerClock {
-    /// A clock that is 0 now.
+    /// A clock that starts at 0 now.
     pub(crate) fn start() -> Self {
         Self { started: Instant::now() }
     }
 
-    /// Now.
+    /// The current time.
     pub(crate) fn now_millis(self) -> f64 {
         self.millis(Instant::now())
     }
 
-    /// Time of an instant; negative before the server started.
+    /// The time of an instant; negative before the server started.
     pub(crate) fn millis(self, at: Instant) -> f64 {
         let after = at.saturating_duration_since(self.started).as_secs_f64();
         let before = self.started.saturating_duration_since(at).as_secs_f64();

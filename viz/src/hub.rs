@@ -41,12 +41,12 @@ impl Hub {
         self.shared.status.send_replace(Some(Arc::new(status.thinned())));
     }
 
-    /// Replaces the state of the latest status and keeps its figures, such as the scores while the model is saved.
+    /// Replaces the state in the latest status and keeps its numbers, for example the scores while the model is saved.
     pub fn set_state(&self, state: &str) {
         self.change_status(|status| state.clone_into(&mut status.state));
     }
 
-    /// Reports the result of the run: clients show it, also after the server has stopped.
+    /// Reports the result of the run. Clients keep showing it after the server has stopped.
     pub fn set_ended(&self, ended: Ended) {
         self.change_status(|status| {
             "finished".clone_into(&mut status.state);

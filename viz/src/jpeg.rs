@@ -5,7 +5,7 @@ use std::num::NonZero;
 
 /// An image of fewer pixels than this per thread gains nothing from another thread.
 const MIN_STRIP_PX: usize = 96 * 1024;
-/// More threads than this gain little for an image of a screen's size.
+/// More threads than this gain little for an image the size of a screen.
 const MAX_THREADS: usize = 8;
 
 /// Resolution of color relative to brightness.
@@ -59,7 +59,7 @@ impl Layout {
 }
 
 impl Pixels<'_> {
-    /// Checks that there are as many bytes as the size says.
+    /// Checks that the number of bytes matches the size.
     pub(crate) fn check(&self) -> Result<(), Unencodable> {
         let [width, height] = self.size_px;
         let needed = width as usize * height as usize * self.layout.n_channels();
@@ -68,12 +68,12 @@ impl Pixels<'_> {
     }
 }
 
-/// Threads that a picture may be packed on.
+/// Number of threads for encoding a picture.
 pub(crate) fn n_threads() -> usize {
     std::thread::available_parallelism().map_or(1, NonZero::get).min(MAX_THREADS)
 }
 
-/// A baseline JPEG file.
+/// Encodes a baseline JPEG file.
 pub(crate) fn encode(pixels: &Pixels<'_>, quality: u8, chroma: Chroma) -> Result<Vec<u8>, Unencodable> {
     let n_px = pixels.size_px[0] as usize * pixels.size_px[1] as usize;
     encode_in_strips(pixels, quality, chroma, n_threads().min(n_px / MIN_STRIP_PX))
@@ -81,9 +81,9 @@ pub(crate) fn encode(pixels: &Pixels<'_>, quality: u8, chroma: Chroma) -> Result
 
 /// Encodes about `n_strips` strips in parallel.
 ///
-/// A strip is an image of its own whose rows of blocks are complete. Its scan starts and ends at a byte and predicts
-/// nothing from the strip before, which is just what happens at a restart marker: joined by these markers, the scans are
-/// the scan of the whole image with a restart interval of one strip (ITU-T T.81, sections B.2.4.4 and F.1.1.5).
+/// A strip is a separate image with complete rows of blocks. Its scan starts and ends at a byte and predicts nothing
+/// from the strip before, exactly as at a restart marker. Joined by these markers, the scans therefore form the scan of
+/// the whole image with a restart interval of one strip (ITU-T T.81, sections B.2.4.4 and F.1.1.5).
 fn encode_in_strips(pixels: &Pixels<'_>, quality: u8, chroma: Chroma, n_strips: usize) -> Result<Vec<u8>, Unencodable> {
     pixels.check()?;
     let [width, height] = pixels.size_px;
@@ -149,7 +149,7 @@ const END_OF_IMAGE: [u8; 2] = [0xFF, 0xD9];
 const START_OF_SCAN: u8 = 0xDA;
 const DEFINE_RESTART_INTERVAL: u8 = 0xDD;
 
-/// Where the parts of a strip's file begin.
+/// Offsets of the parts of a strip's file.
 struct Parts {
     /// The height in the frame header.
     height: usize,
@@ -159,7 +159,7 @@ struct Parts {
     scan: usize,
 }
 
-/// Joins the files of strips to the file of the whole image.
+/// Joins the files of the strips into the file of the whole image.
 fn join(strips: &[Vec<u8>], height_px: u16, interval: u16) -> Vec<u8> {
     let first = &strips[0];
     let parts = parts_of(first);
@@ -180,7 +180,7 @@ fn join(strips: &[Vec<u8>], height_px: u16, interval: u16) -> Vec<u8> {
     file
 }
 
-/// Walks through the segments of a file that the encoder wrote.
+/// Iterates over the segments of a file that the encoder wrote.
 fn parts_of(file: &[u8]) -> Parts {
     let mut height = 0;
     let mut at = 2;
@@ -264,7 +264,7 @@ mod tests {
 
     #[test]
     fn decoded_colors_are_close_to_the_source() {
-        // Without alignment, a swapped channel or a shifted row, errors reach tens.
+        // Misalignment, a swapped channel or a shifted row would give errors in the tens.
         const MEAN_ABS: f64 = 4.0;
         for (layout, chroma) in
             [(Layout::Rgb, Chroma::Full), (Layout::Rgba, Chroma::Full), (Layout::Rgba, Chroma::Halved)]

@@ -105,7 +105,7 @@ pub struct KeyframePose {
 /// Pixels of a live image, sRGB.
 #[derive(Clone, Debug)]
 pub enum LivePixels {
-    /// A whole JPEG file; sent unchanged if it is small.
+    /// A complete JPEG file; sent unchanged if the image is small.
     Jpeg(Arc<[u8]>),
     /// `[height, width, 3]`.
     Rgb(Arc<[u8]>),
@@ -120,9 +120,9 @@ pub struct LiveImage {
     pub camera: Arc<str>,
     /// Mid-exposure.
     pub stamp: Stamp,
-    /// The same moment on this process's clock, from which viewers compute the image's age.
+    /// The same moment on this process's clock, for the image's age.
     ///
-    /// Stamps of recordings and simulations are on other clocks; for them, pass the time at which the image was read.
+    /// Recordings and simulations stamp with other clocks; for them, pass the time at which the image was read.
     pub captured_at: Instant,
     /// Width and height, pixels.
     pub size_px: [u32; 2],

@@ -40,7 +40,7 @@ pub(crate) const FILES: &[PageFile] = &[
 ];
 
 impl PageFile {
-    /// The response to a GET request: the file, compressed if the client accepts that, or 304 if it has this version.
+    /// The response to a GET request: the file, compressed if the client accepts that, or 304 if the client has this version.
     pub(crate) fn response(&self, request: &HeaderMap) -> Response {
         let etag = self.etag();
         let shared: [(HeaderName, &str); 3] =
@@ -56,7 +56,7 @@ impl PageFile {
         }
     }
 
-    /// Checksum and size of the file, which end its gzip form. Weak: both encodings share it.
+    /// Checksum and size of the file, which are the last bytes of its gzip form. Weak: both encodings share it.
     fn etag(&self) -> String {
         let trailer = &self.gzip[self.gzip.len() - 8..];
         let hex: String = trailer.iter().map(|byte| format!("{byte:02x}")).collect();

@@ -11,9 +11,9 @@ use trainer::Picture;
 const QUALITY_LAST: u8 = 92;
 /// JPEG quality of everything that is replaced soon.
 const QUALITY_BRIEF: u8 = 80;
-/// Color of pictures with fewer pixels keeps its resolution: there is little to gain, and they are shown enlarged.
+/// Smaller pictures keep full color resolution: halving it saves little, and they are shown enlarged.
 const MIN_HALVED_PX: usize = 256 * 256;
-/// Live images are sent at most this wide: the page shows them smaller still.
+/// Maximum width of live images as sent; the page shows them smaller still.
 const MAX_LIVE_WIDTH_PX: u32 = 640;
 /// Depth of fewer pixels than this per thread gains nothing from another thread.
 const MIN_DEPTH_PX: usize = 128 * 1024;
@@ -27,7 +27,7 @@ pub(crate) enum Unsendable {
     Encode(#[from] Unencodable),
     #[error("the JPEG file cannot be decoded: {0}")]
     Decode(#[from] image::ImageError),
-    #[error("the JPEG file is {got:?} pixels but {expected:?} were announced")]
+    #[error("the JPEG file has {got:?} pixels, expected {expected:?}")]
     Announced { got: [u32; 2], expected: [u32; 2] },
 }
 
@@ -38,7 +38,7 @@ pub(crate) fn pack_picture(
     picture: &Picture,
 ) -> Result<Vec<u8>, Unsendable> {
     let (color, depth) = std::thread::scope(|scope| {
-        // Both at once: color takes most of the time and keeps this thread.
+        // Color and depth in parallel: color takes most of the time and keeps this thread.
         let depth = order.depth.map(|format| scope.spawn(move || pack_depth(format, picture)));
         let color = order.color.then(|| pack_color(picture, header.last));
         (color, depth.map(|task| task.join().expect("packing depth does not panic")))
@@ -68,7 +68,7 @@ fn pack_color(picture: &Picture, is_last: bool) -> Result<Vec<u8>, Unencodable> 
     encode(&pixels, quality, if is_last || is_small { Chroma::Full } else { Chroma::Halved })
 }
 
-/// The binary message of a live image, shrunk to what a page shows.
+/// The binary message of a live image, shrunk to the size that the page shows.
 pub(crate) fn pack_live_image(image: &LiveImage, clock: ServerClock) -> Result<Vec<u8>, Unsendable> {
     // A very flat image keeps one row.
     let factor = image.size_px[0].div_ceil(MAX_LIVE_WIDTH_PX).min(image.size_px[1]).max(1);
@@ -148,7 +148,7 @@ fn half_depth(picture: &Picture, n_threads: usize) -> PackedDepth {
                 let mut nearest_m = vec![0.0; out_width];
                 for (rows, packed) in band.chunks(2 * width).zip(packed.chunks_exact_mut(2 * out_width)) {
                     let (upper, lower) = rows.split_at(width);
-                    // The last row of an odd height has none below it.
+                    // The last row of an odd height has no row below it.
                     nearest_of_squares(upper, if lower.is_empty() { upper } else { lower }, &mut nearest_m);
                     write_counts(&nearest_m, 1.0 / metres_per_count, packed);
                 }
@@ -158,7 +158,7 @@ fn half_depth(picture: &Picture, n_threads: usize) -> PackedDepth {
     PackedDepth { size_px, metres_per_count, bytes }
 }
 
-/// Depth of a pixel where something is seen, else infinity.
+/// Depth of a pixel, or infinity if nothing was seen there.
 fn seen_or_infinity(depth_m: f32) -> f32 {
     // False for a NaN.
     if depth_m > 0.0 { depth_m } else { f32::INFINITY }

@@ -10,7 +10,7 @@ use trainer::Picture;
 /// Pictures of one client that may be drawn or on their way; a slow client costs no more rendering than this.
 const MAX_UNSENT: usize = 2;
 
-/// Where the full picture is expected to take less time than this, coarser stages before it only delay it.
+/// If the full picture is expected to take less time than this, coarser stages would only delay it.
 const FAST_MILLIS: f64 = 20.0;
 
 /// All connected clients and what they wait for.
@@ -106,7 +106,7 @@ impl Queue {
         self.clients.get_mut(&client)?.take(client)
     }
 
-    /// Remembers how long the last stage of an order took to draw.
+    /// Records how long the last stage of an order took to draw.
     pub(crate) fn drawn(&mut self, ticket: &Ticket, millis: f64) {
         if let Some(waiting) = self.clients.get_mut(&ticket.client) {
             let (method, n_px) = (ticket.order.method.clone(), n_px_of_last_stage(&ticket.order));
@@ -153,7 +153,7 @@ impl Waiting {
 }
 
 impl FullPicture {
-    /// Time that the last stage of an order is expected to take: in proportion to its pixels, if it has more.
+    /// Expected time of the last stage of an order: that of the last picture, scaled up if the order has more pixels.
     fn expected_millis(&self, order: &RenderOrder) -> f64 {
         if self.method != order.method {
             return f64::INFINITY;
@@ -252,7 +252,7 @@ mod tests {
             }
             scales
         };
-        assert_eq!(draw(&mut queue, 1, 19.0, |_| ()), [0.1, 0.5, 1.0], "nothing is known yet");
+        assert_eq!(draw(&mut queue, 1, 19.0, |_| ()), [0.1, 0.5, 1.0], "there is no earlier picture");
         assert_eq!(draw(&mut queue, 2, 21.0, |_| ()), [1.0], "the last one was fast");
         assert_eq!(draw(&mut queue, 3, 3.0, |_| ()), [0.1, 0.5, 1.0], "the last one was slow");
         assert_eq!(draw(&mut queue, 4, 3.0, |order| order.stages = vec![0.5]), [0.5]);

@@ -26,21 +26,21 @@ use tokio::sync::watch;
 
 /// How long a stopping server waits for its clients to be told.
 const GOODBYE_TIMEOUT: Duration = Duration::from_millis(500);
-/// A request whose headers are not complete after this long ends its connection, and so does the wait for a next request.
+/// A connection is closed if the headers of a request, or the next request, take longer than this.
 const HEADER_TIMEOUT: Duration = Duration::from_secs(3);
 /// Longest request with all its headers, bytes.
 const MAX_REQUEST_BYTES: usize = 32 * 1024;
-/// How often connections are checked for having been idle, stuck or silent for too long.
+/// How often connections are checked for timeouts.
 const SWEEP_PERIOD: Duration = Duration::from_millis(250);
-/// After a failed accept, the next one waits this long.
+/// Pause after a failed accept.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
-/// Bytes that the kernel may hold for a client that reads slowly; Linux doubles it. More would only age there.
+/// Bytes that the kernel may buffer for a client that reads slowly; Linux doubles it. More data would only get old there.
 #[cfg(unix)]
 const SEND_BUFFER_BYTES: usize = 64 * 1024;
 /// Connections that may wait to be accepted.
 #[cfg(unix)]
 const BACKLOG: i32 = 1024;
-/// What the page may load and who may embed it.
+/// Which sources the page may load, and which sites may embed it.
 const CONTENT_SECURITY_POLICY: &str = "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none'; \
      form-action 'none'; frame-ancestors 'none'";
 
@@ -149,7 +149,7 @@ async fn serve(listener: TcpListener, hub: Hub, mut stopped: watch::Receiver<boo
     Ok(())
 }
 
-/// Sets what accepted sockets inherit; a failure costs only some delay.
+/// Sets options that accepted sockets inherit; if that fails, only latency suffers.
 #[cfg(unix)]
 fn tune(listener: &TcpListener) {
     let tuned = rustix::net::sockopt::set_socket_send_buffer_size(listener, SEND_BUFFER_BYTES)
@@ -164,21 +164,21 @@ async fn accept(listener: &tokio::net::TcpListener, admission: &Arc<Admission>, 
     loop {
         match listener.accept().await {
             Ok((stream, _)) => {
-                // Small messages must not wait for large ones to be acknowledged; without it, only the delay grows.
+                // Small messages must not wait until large ones are acknowledged; if this fails, only latency suffers.
                 if let Err(error) = stream.set_nodelay(true) {
-                    log::debug!("cannot switch off Nagle's algorithm: {error}");
+                    log::debug!("cannot disable Nagle's algorithm: {error}");
                 }
                 let (stream, has_evicted) = admission.admit(stream);
                 tokio::spawn(serve_connection(stream, app.clone()));
                 if has_evicted {
-                    // The other connection's task closes its descriptor before the next one is accepted.
+                    // Lets the task of the closed connection release its descriptor before the next accept.
                     tokio::task::yield_now().await;
                 }
             }
-            // The peer has left again.
+            // The peer has already disconnected.
             Err(error) if matches!(error.kind(), ErrorKind::ConnectionAborted | ErrorKind::ConnectionReset) => {}
             Err(error) => {
-                // Most likely all file descriptors are in use: one is given back, and the pause avoids a busy loop.
+                // Most likely all file descriptors are in use: free one, and pause to avoid a busy loop.
                 log::warn!("cannot accept a connection: {error}");
                 admission.evict();
                 tokio::time::sleep(ACCEPT_PAUSE).await;
@@ -211,7 +211,7 @@ async fn serve_connection(stream: GuardedStream, app: TowerToHyperService<Router
         .with_upgrades()
         .await;
     if let Err(error) = served {
-        log::debug!("a connection broke: {error}");
+        log::debug!("a connection failed: {error}");
     }
 }
 
@@ -251,14 +251,14 @@ async fn connect(
     State(visited): State<Visited>,
 ) -> Response {
     if !visited.admission.seat(&connection) {
-        return (StatusCode::SERVICE_UNAVAILABLE, "all seats for clients are in use, try again later").into_response();
+        return (StatusCode::SERVICE_UNAVAILABLE, "too many clients are connected, try again later").into_response();
     }
     upgrade
         .max_message_size(MAX_MESSAGE_BYTES)
         .on_upgrade(move |socket| session::serve(socket, connection, visited.site))
 }
 
-/// Adds headers that keep other web sites from embedding or reading what is served.
+/// Adds headers that keep other web sites from embedding or reading the responses.
 async fn secure(request: Request, next: Next) -> Response {
     let mut response = next.run(request).await;
     let headers = response.headers_mut();

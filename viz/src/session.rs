@@ -19,23 +19,23 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::{JoinError, JoinHandle};
 use tokio::time::MissedTickBehavior;
 
-/// A heartbeat goes out this often, so that a page notices silence soon.
+/// Period of heartbeats, short enough that a page notices silence soon.
 const HEARTBEAT_PERIOD: Duration = Duration::from_millis(250);
-/// A WebSocket ping goes out this often, if the last one was answered.
+/// Period of WebSocket pings; the next one is sent only if the last one was answered.
 const PING_PERIOD: Duration = Duration::from_secs(1);
-/// Answers that may wait for a client to read; one that asks for more without reading is disconnected.
+/// Maximum number of answers that wait for a client to read; a client that requests more is disconnected.
 const MAX_REPLIES: usize = 64;
-/// Live images and keyframe lists wait at most this long for pictures, which go first.
+/// Pictures are sent before live images and keyframe lists, but delay them by at most this long.
 const MAX_NEWS_DELAY: Duration = Duration::from_millis(500);
 
-/// What all sessions share.
+/// Shared by all sessions.
 #[derive(Clone)]
 pub(crate) struct Site {
-    /// Where requests go and pictures come from.
+    /// Takes requests and returns pictures.
     pub(crate) hub: Hub,
     /// The server's clock.
     pub(crate) clock: ServerClock,
-    /// Encoded news.
+    /// The latest encoded messages.
     pub(crate) bulletin: watch::Receiver<Bulletin>,
     /// Becomes true when the server stops.
     pub(crate) stopped: watch::Receiver<bool>,
@@ -70,7 +70,7 @@ impl Drop for Membership<'_> {
     }
 }
 
-/// What the reader asks the writer to send.
+/// A message that the reader asks the writer to send.
 enum Reply {
     Error { id: Option<u64>, message: String },
     Pong { t: f64 },
@@ -86,7 +86,7 @@ struct Reader<'a> {
 }
 
 impl Reader<'_> {
-    /// Reads until the client leaves or breaks the rules.
+    /// Reads until the client disconnects or violates the protocol.
     async fn run(mut self) {
         while let Some(Ok(message)) = self.stream.next().await {
             let reply = match message {
@@ -99,14 +99,14 @@ impl Reader<'_> {
                 Message::Text(text) => self.answer(&text),
                 Message::Binary(_) => Some(Reply::Error {
                     id: None,
-                    message: "binary messages are not understood, send JSON as text".to_owned(),
+                    message: "binary messages are not supported, send JSON as text".to_owned(),
                 }),
             };
             self.connection.spoke();
             let Some(reply) = reply else { continue };
             let is_last = matches!(reply, Reply::Goodbye { .. });
             if self.replies.try_send(reply).is_err() {
-                log::info!("client {} is disconnected: it does not read {MAX_REPLIES} answers", self.client);
+                log::info!("client {} is disconnected: it left {MAX_REPLIES} answers unread", self.client);
                 return;
             }
             if is_last {
@@ -124,10 +124,10 @@ impl Reader<'_> {
             }
             Ok(Understood::SameVersion) => None,
             Ok(Understood::OtherVersion(theirs)) => Some(Reply::Goodbye {
-                reason: format!("this server speaks protocol {PROTOCOL_VERSION}, the client {theirs}"),
+                reason: format!("the client speaks protocol {theirs}, this server {PROTOCOL_VERSION}"),
             }),
             Ok(Understood::Ping { t }) => Some(Reply::Pong { t }),
-            Ok(Understood::Goodbye) => Some(Reply::Goodbye { reason: "the client leaves".to_owned() }),
+            Ok(Understood::Goodbye) => Some(Reply::Goodbye { reason: "the client disconnected".to_owned() }),
             Err(error) => Some(Reply::Error { id: id_of(text), message: error.to_string() }),
         }
     }
@@ -150,7 +150,7 @@ struct Packing {
 }
 
 impl Writer<'_> {
-    /// Sends until the connection breaks or a goodbye is sent; pictures go before news.
+    /// Sends until the connection fails or a goodbye is sent; pictures go before other messages.
     async fn run(mut self, wake: &tokio::sync::Notify, mut replies: mpsc::Receiver<Reply>) -> Going {
         let mut stopped = self.site.stopped.clone();
         let mut bulletin = self.site.bulletin.clone();
@@ -236,7 +236,7 @@ impl Writer<'_> {
         }
     }
 
-    /// The last status holds the result of the run.
+    /// Sends the last status, which holds the result of the run, then a goodbye.
     async fn part_when_stopped(&mut self) -> Going {
         let latest = self.site.hub.status().borrow().clone();
         if let Some(status) = latest {
@@ -270,7 +270,7 @@ impl Writer<'_> {
     }
 }
 
-/// An encoded picture, or why there is none.
+/// An encoded picture, or the reason why there is none.
 type Packed = Result<Result<Vec<u8>, Unsendable>, JoinError>;
 
 fn pack(drawn: Box<(crate::queue::Ticket, crate::protocol::PictureHeader, trainer::Picture)>) -> Packing {
@@ -290,7 +290,7 @@ async fn finished(packing: &mut Option<Packing>) -> Packed {
     }
 }
 
-/// Waits for a message that the client has not received.
+/// Waits for a message that the client has not received yet.
 async fn next_news(bulletin: &mut watch::Receiver<Bulletin>, received: &mut Received, long: bool) -> Message {
     loop {
         if let Some(message) = bulletin.borrow_and_update().next(received, long) {

@@ -1,4 +1,4 @@
-//! What the server does with sockets that only cost: half-open requests, clients that never read, more clients than seats.
+//! Unresponsive clients: half-open requests, clients that never read, more clients than the limit.
 
 #[expect(dead_code, reason = "the tests of the protocol use all of it")]
 mod client;
@@ -16,9 +16,9 @@ use viz::{Ended, Hub, LiveImage, LivePixels, ModelStatus, Server, ServerConfig, 
 
 /// Far more than loopback needs; a test that waits this long has failed.
 const PATIENCE: Duration = Duration::from_secs(20);
-/// A new viewer sees the page and is connected within this time, whatever else is connected.
+/// A new viewer gets the page and is connected within this time, whatever else is connected.
 const VIEWER_PATIENCE: Duration = Duration::from_secs(1);
-/// A half-open request is closed after 3 s; two busy cores may delay that.
+/// A half-open request is closed after 3 s; on two busy cores it may take longer.
 const HALF_OPEN_SECS: std::ops::Range<f64> = 2.0..8.0;
 /// A client that never reads is disconnected after 8 s, at the next check.
 const NEVER_READING_SECS: std::ops::Range<f64> = 5.0..16.0;
@@ -75,7 +75,7 @@ fn secs_until_closed(stream: &mut TcpStream) -> f64 {
     begun.elapsed().as_secs_f64()
 }
 
-/// Both ends of all connections are in this process.
+/// Raises the limit on open files: both ends of all connections are in this process.
 #[cfg(unix)]
 fn raise_descriptor_limit(wanted: u64) {
     use rustix::process::{Resource, getrlimit, setrlimit};
@@ -88,7 +88,7 @@ fn raise_descriptor_limit(wanted: u64) {
     }
 }
 
-/// A client that is in use on a thread of its own, as a page is.
+/// A client on a thread of its own that stays in use, as a page does.
 struct Viewer {
     stop: Arc<AtomicBool>,
     thread: std::thread::JoinHandle<bool>,
@@ -112,16 +112,16 @@ impl Viewer {
         Self { stop, thread }
     }
 
-    /// Whether it was connected all the time.
+    /// Stops it; returns whether it stayed connected throughout.
     fn stop(self) -> bool {
         self.stop.store(true, Ordering::Relaxed);
         self.thread.join().unwrap_or(false)
     }
 }
 
-/// Opens the page and a client as a browser would; returns the client, which has its hello.
+/// Opens the page and a client as a browser would; returns the client after its `hello`.
 ///
-/// Other tests keep the cores busy: the fastest of a few viewers counts.
+/// Other tests keep the cores busy, so only the fastest of a few viewers counts.
 fn open_viewer(address: SocketAddr) -> Client {
     let mut took = Duration::MAX;
     for _ in 0..4 {
@@ -149,7 +149,7 @@ fn a_viewer_connects_while_idle_sockets_pile_up() {
     let half_open: Vec<_> = (0..2000)
         .map(|_| {
             let mut stream = connect(address);
-            // The server may have closed an older one's place already.
+            // The server may already have closed it in favor of a newer connection.
             let _ = stream.write_all(b"GET / HTTP/1.1\r\nHost: loc");
             stream
         })
@@ -158,7 +158,7 @@ fn a_viewer_connects_while_idle_sockets_pile_up() {
     let silent: Vec<_> = (0..500).map(|_| upgrade_only(address)).collect();
     let mut other = open_viewer(address);
     wait_until(|| hub.n_clients() <= 32);
-    assert!(viewer.stop(), "a viewer that is in use keeps its seat while 500 others come");
+    assert!(viewer.stop(), "a viewer in use stays connected while 500 others connect");
     let mut message = render_message(1, [64, 48]);
     message["stages"] = json!([1.0]);
     other.say(&message);

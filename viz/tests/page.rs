@@ -23,7 +23,7 @@ const WINDOW_PX: [u32; 2] = [1280, 760];
 /// Sizes of the screenshots in `CARGO_TARGET_TMPDIR`.
 const DESKTOP_PX: [u32; 2] = [1280, 800];
 const PHONE_PX: [u32; 2] = [390, 844];
-/// The loss of the server is shown within this time.
+/// The page shows a lost connection within this time.
 const LOSS_SHOWN_WITHIN_MILLIS: f64 = 1000.0;
 /// Far more than two busy cores need to draw the page in software.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -295,7 +295,7 @@ fn check_reconnect(browser: &mut Browser, server: Server, hub: &Hub) {
     drop(server);
 }
 
-/// Runs the page through a link that is cut, as a wireless one is, and up to the end of the run.
+/// Runs the page through a proxy that cuts the connection, as a wireless link would, up to the end of the run.
 #[test]
 fn the_page_shows_a_lost_server_and_the_end_of_a_run() {
     let bundle = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("web/dist/app.js");
@@ -332,7 +332,7 @@ fn the_page_shows_a_lost_server_and_the_end_of_a_run() {
     std::thread::sleep(Duration::from_millis(1500));
     assert_eq!(browser.text("banner"), "");
     let shown_after = browser.evaluate("record.shownAfter").as_f64().expect("the loss was shown");
-    assert!(shown_after < LOSS_SHOWN_WITHIN_MILLIS, "the loss was shown after {shown_after} ms");
+    assert!(shown_after < LOSS_SHOWN_WITHIN_MILLIS, "the lost connection was shown after {shown_after} ms");
     assert_eq!(browser.evaluate("record.isLive"), false, "an image from before the cut was called live");
     assert!(label(&mut browser).contains("old"), "{}", label(&mut browser));
     let camera = Camera::start(hub.clone());
@@ -357,7 +357,7 @@ fn the_page_shows_a_lost_server_and_the_end_of_a_run() {
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
-/// Notes at every change of the page when the banner appears and whether a label says `live`.
+/// Records, at every change of the page, when the banner appears and whether a label says `live`.
 const RECORDER: &str = "
     window.record = { cutAt: Infinity, shownAfter: null, isLive: false };
     setInterval(() => {
@@ -367,13 +367,13 @@ const RECORDER: &str = "
             record.isLive ||= label.textContent === 'live';
     }, 20)";
 
-/// What the page says about the age of the live image.
+/// The label of the live image, which shows its age.
 fn label(browser: &mut Browser) -> String {
     let label = browser.evaluate("document.querySelector('#live figcaption span')?.textContent ?? ''");
     label.as_str().unwrap_or_default().to_owned()
 }
 
-/// Writes screenshots for both window sizes.
+/// Saves screenshots for both window sizes.
 fn shoot(browser: &mut Browser, name: &str) {
     for (window, size_px) in [("phone", PHONE_PX), ("desktop", DESKTOP_PX)] {
         browser.resize(size_px);

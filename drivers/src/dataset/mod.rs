@@ -37,7 +37,7 @@ fn is_nerfstudio(path: &Path) -> bool {
     path.is_file() || path.join(nerfstudio::FILE_NAME).is_file()
 }
 
-/// Whether `path` is a folder that [`read`] takes for a dataset; its contents are not checked.
+/// Whether [`read`] accepts `path` as a dataset folder; its contents are not checked.
 pub fn is_dataset_folder(path: &Path) -> bool {
     [nerfstudio::FILE_NAME, tum::COLOR_LIST].iter().any(|name| path.join(name).is_file())
 }

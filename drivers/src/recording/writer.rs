@@ -34,7 +34,7 @@ pub struct About<'a> {
 /// A file in which no sample has arrived is removed when writing fails or ends.
 pub struct Recorder {
     path: PathBuf,
-    /// None after a failure.
+    /// `None` after a failure.
     mcap: Option<mcap::Writer<Box<dyn Sink>>>,
     channels: BTreeMap<(Topic, &'static str), u16>,
     cameras: Vec<(String, Intrinsics)>,
@@ -127,10 +127,10 @@ impl Recorder {
         self.mcap.as_mut().ok_or_else(|| McapError::Io(std::io::Error::other("an earlier write failed")))
     }
 
-    /// Closes the file after a failure; the error says how much of it a reader finds. A file that holds nothing is removed.
+    /// Closes the file after a failure; the error reports how much of it can be read. A file without samples is removed.
     fn broken(&mut self, error: McapError) -> Error {
         if self.mcap.take().is_some() {
-            // The chunk that broke off holds some samples, too: what counts is what a reader finds.
+            // The truncated chunk also holds some samples, so the readable samples are counted.
             self.kept = readable(&self.path);
             if self.kept.n_samples == 0 {
                 remove_stub(&self.path);
@@ -257,7 +257,7 @@ impl std::fmt::Debug for Recorder {
     }
 }
 
-/// What can be read of a recording that was cut off.
+/// Counts what can be read of a truncated recording.
 fn readable(path: &Path) -> Kept {
     let (mut n_samples, mut stamps) = (0, None);
     if let Ok(mut recording) = Recording::open(path) {
@@ -269,7 +269,7 @@ fn readable(path: &Path) -> Kept {
     Kept { n_samples, seconds: length_secs(stamps) }
 }
 
-/// The range of stamps with one more.
+/// The range of stamps extended by one stamp.
 fn with_stamp(range: Option<[Stamp; 2]>, stamp: Stamp) -> [Stamp; 2] {
     let [first, last] = range.unwrap_or([stamp; 2]);
     [first.min(stamp), last.max(stamp)]
@@ -363,7 +363,7 @@ mod tests {
             assert_eq!(sample, reading(n_samples));
             n_samples += 1;
         }
-        // The chunk that broke off counts, too: what is reported is what a reader finds.
+        // Samples of the truncated chunk count too: the error reports what can be read.
         assert!(kept.n_samples > 1000 && n_samples.unsigned_abs() == kept.n_samples, "{n_samples} of {kept:?}");
         assert!((kept.seconds - 1e-3 * (kept.n_samples - 1) as f64).abs() < 1e-9, "{kept:?}");
         assert!(recording.damage().is_some());

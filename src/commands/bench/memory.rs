@@ -1,4 +1,4 @@
-//! `fieldrig bench memory`: resident memory of a long run, and how fast it grows once the keyframe store is full.
+//! `fieldrig bench memory`: memory use of a long run, and its growth rate once the keyframe store is full.
 
 use crate::bench::memory::{Beyond, Growth, Sample, resident_bytes};
 use crate::bench::page::{Findings, Table};
@@ -16,15 +16,15 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Longest time between two lines on stdout.
+/// Maximum time between two lines on stdout.
 const TELL_EVERY: Duration = Duration::from_secs(60);
-/// Charts and numbers are written this often: an interrupted bench shows what it has.
+/// Charts and numbers are written this often, so that an interrupted bench leaves results.
 const WRITE_EVERY: Duration = Duration::from_secs(60);
 /// Points of a line in the chart.
 const MAX_POINTS: usize = 60;
 /// Labels of GPU buffers that hold images of keyframes.
 const IMAGE_BUFFERS: [&str; 3] = ["splat.target_image", "splat.target_depth", "splat.held_back"];
-/// GPU buffers that the table lists, the largest first.
+/// Number of GPU buffers in the table, the largest first.
 const MAX_GPU_PARTS: usize = 12;
 const BYTES_PER_MB: f64 = 1e6;
 const SECS_PER_MINUTE: f64 = 60.0;
@@ -37,7 +37,7 @@ pub(crate) struct Args {
     /// Simulate the devices of the rig file, in real time
     #[arg(long, conflicts_with = "from")]
     sim: bool,
-    /// Replay a recording instead of live devices; training goes on after its end
+    /// Replay a recording instead of live devices; training continues after its end
     #[arg(long, value_name = "RECORDING")]
     from: Option<PathBuf>,
     /// Length of the run, counted from the first image
@@ -46,13 +46,13 @@ pub(crate) struct Args {
     /// Time between two samples
     #[arg(long, value_name = "S", default_value_t = 1.0)]
     every_secs: f64,
-    /// Connected viewers that ask for one picture after another, 0 to 32
+    /// Number of connected viewers that request pictures back to back, 0 to 32
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(0..=32))]
     viewers: u64,
     /// Folder for charts and numbers
     #[arg(long, value_name = "DIR", default_value = "bench-memory")]
     out: PathBuf,
-    /// Print one JSON object a sample
+    /// Print one JSON object per sample
     #[arg(long)]
     json: bool,
     /// Further flags of `fieldrig run`
@@ -60,7 +60,7 @@ pub(crate) struct Args {
     run_flags: Vec<OsString>,
 }
 
-/// The flags of `run` as a command line of their own.
+/// The flags of `run`, parsed as a command line.
 #[derive(Debug, Parser)]
 struct RunFlags {
     #[command(flatten)]
@@ -70,7 +70,7 @@ struct RunFlags {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     args.check()?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}", args.out.display()))?;
-    // Checkpoints are a part of a run: they are written, and thrown away with their folder.
+    // Checkpoints are part of a run: they are written, and then removed with their folder.
     let run_folder = args.out.join(format!("run-{}", std::process::id()));
     let measured = args.run_flags(&run_folder).and_then(|flags| measure(args, &flags));
     if run_folder.exists() {
@@ -80,12 +80,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let findings = findings(args, &measured)?;
     findings.tell(&findings.write(&args.out)?, args.json)?;
     match measured.input_error.take() {
-        Some(error) => Err(anyhow::Error::new(error).context("the devices failed before the run was over")),
+        Some(error) => Err(anyhow::Error::new(error).context("the devices failed before the end of the run")),
         None => Ok(Exit::Done),
     }
 }
 
-/// What a run was measured to take.
+/// The measurements of a run.
 #[derive(Debug, Default)]
 struct Measured {
     /// Whether the GPU's memory is the host's.
@@ -93,7 +93,7 @@ struct Measured {
     samples: Vec<Sample>,
     /// GPU buffers at the last sample, bytes by label.
     gpu_parts: BTreeMap<Arc<str>, u64>,
-    /// Why the devices ended before the run did.
+    /// Why the devices ended early.
     input_error: Option<drivers::Error>,
 }
 
@@ -207,7 +207,7 @@ impl Args {
     }
 }
 
-/// One of the things that take memory.
+/// One component of memory use.
 struct Part {
     label: &'static str,
     bytes: fn(&Sample) -> Option<u64>,
@@ -222,7 +222,7 @@ const PARTS: [Part; 6] = [
     Part { label: "reserved for GPU buffers", bytes: |sample| sample.gpu_reserved_bytes },
 ];
 
-/// Medians of groups of samples, and their extents.
+/// The median and range of each group of samples.
 fn line(part: &Part, samples: &[Sample]) -> Line {
     let of_group = |group: &[Sample]| {
         let mut mb: Vec<f64> = group.iter().filter_map(part.bytes).map(|bytes| bytes as f64 / BYTES_PER_MB).collect();
@@ -242,15 +242,15 @@ fn line(part: &Part, samples: &[Sample]) -> Line {
 fn findings(args: &Args, measured: &Measured) -> anyhow::Result<Findings> {
     let samples = &measured.samples;
     let growths: Vec<(&str, Growth)> = match measured.is_software {
-        true => vec![("beyond the model", Beyond::Model), ("beyond model and training buffers", Beyond::Training)],
+        true => vec![("without the model", Beyond::Model), ("without model and training buffers", Beyond::Training)],
         false => vec![("of the host", Beyond::Nothing)],
     }
     .into_iter()
     .filter_map(|(name, beyond)| Some((name, Growth::of(samples, beyond)?)))
     .collect();
-    let rate = growths.first().map_or("too short for a rate".to_owned(), |(name, growth)| {
+    let rate = growths.first().map_or("too short to measure a growth rate".to_owned(), |(name, growth)| {
         let since = if growth.store_was_full { "with a full keyframe store" } else { "in the second half" };
-        format!("{:+.2} % an hour {name} {since}", growth.percent_per_hour)
+        format!("{:+.2} % per hour {name} {since}", growth.percent_per_hour)
     });
     let conditions = format!("{}, {}", args.input(), print::counted(args.viewers, "viewer"));
     let lines: Vec<Line> =
@@ -277,7 +277,7 @@ fn findings(args: &Args, measured: &Measured) -> anyhow::Result<Findings> {
     }
     for (name, growth) in &growths {
         let (from, to) = (growth.from_seconds, growth.to_seconds);
-        let of = format!("{} an hour, {:+.2} %", mb(growth.bytes_per_hour), growth.percent_per_hour);
+        let of = format!("{} per hour, {:+.2} %", mb(growth.bytes_per_hour), growth.percent_per_hour);
         add(&format!("growth {name}, {from:.0} s to {to:.0} s"), of);
     }
     let mut gpu_parts: Vec<(&Arc<str>, u64)> =
@@ -290,9 +290,9 @@ fn findings(args: &Args, measured: &Measured) -> anyhow::Result<Findings> {
         title: "Memory of a long run".to_owned(),
         sentences: vec![
             format!("{conditions}: {rate}."),
-            "Growth is that of resident memory from a minute after the keyframe store is full: the median of the slopes between \
-             all pairs of samples. On a software adapter GPU buffers are a part of resident memory; the model's own, and the working \
-             memory of training, whose size goes with the model's, are taken off."
+            "Growth is that of resident memory from one minute after the keyframe store is full: the median of the slopes between \
+             all pairs of samples. On a software adapter, resident memory includes GPU buffers; the model, and the working memory of \
+             training, which grows with the model, are subtracted."
                 .to_owned(),
         ],
         charts: vec![(
@@ -377,10 +377,10 @@ mod tests {
         );
         measured.samples.iter_mut().for_each(|sample| sample.model_bytes = sample.resident_bytes - 900_000_000);
         let findings = findings(&args(&["--sim"]), &measured).expect("numbers");
-        assert!(findings.sentences[0].contains("+0.00 % an hour beyond the model"), "{}", findings.sentences[0]);
+        assert!(findings.sentences[0].contains("+0.00 % per hour without the model"), "{}", findings.sentences[0]);
         assert_eq!(findings.tables[1].rows[0][0], "large");
         let chart = &findings.charts[0].1;
-        assert_eq!(chart.lines.len(), 5, "nothing is known of what is reserved");
+        assert_eq!(chart.lines.len(), 5, "the reserved memory is unknown");
         assert!(chart.lines.iter().all(|line| line.points.len() <= MAX_POINTS), "{}", chart.lines[0].points.len());
         assert_eq!(chart.rules[0].label, "store full: 100 keyframes");
         assert_eq!(findings.numbers["samples"].as_array().map(Vec::len), Some(600));

@@ -36,7 +36,7 @@ enum What {
     Stability(stability::Args),
     /// How far from the shutter the stamps of images are that come late and by another clock, as a histogram
     Stamps(stamps::Args),
-    /// Resident memory of a long run, by parts, and how fast it grows once the keyframe store is full
+    /// Memory use of a long run by component, and its growth rate once the keyframe store is full
     Memory(memory::Args),
 }
 

@@ -275,7 +275,7 @@ fn wait(stop: &Stop, begins: Stamp, args: &Args) -> anyhow::Result<()> {
         if secs >= args.seconds && !std::mem::replace(&mut is_over, true) {
             match args.json {
                 true => print::report_json(&serde_json::json!({ "event": "over" }))?,
-                false => print::report("Played to the end: everything stands still, and answers until Ctrl-C."),
+                false => print::report("Playback has ended: emulated devices stand still but answer until Ctrl-C."),
             }
         }
         std::thread::sleep(POLL);

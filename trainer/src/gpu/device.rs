@@ -10,7 +10,7 @@ use std::sync::mpsc::RecvTimeoutError;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Duration;
 
-/// While a read-back does not arrive, the device is checked this often.
+/// How often the device is checked while a read-back has not arrived.
 const CHECK_EVERY: Duration = Duration::from_millis(100);
 
 /// How to choose the adapter.
@@ -24,7 +24,7 @@ pub struct GpuOptions {
     pub float_atomics: bool,
     /// Lowers the largest binding, bytes; for tests of buffer limits.
     pub max_binding_bytes: Option<u64>,
-    /// Bytes of all storage buffers together, past which the GPU counts as full; for tests of running out of memory.
+    /// Total size of all storage buffers above which the GPU counts as full, bytes; for tests of running out of memory.
     pub memory_limit_bytes: Option<u64>,
     /// Which of [`Gpu::adapters`]; else the fastest.
     pub adapter: Option<usize>,
@@ -43,9 +43,9 @@ impl Default for GpuOptions {
     }
 }
 
-/// Bytes of read-back buffers that are kept for the next read: a picture of 1024x1024 with depth takes 8 MiB.
+/// Maximum total size of read-back buffers kept for reuse: a picture of 1024x1024 with depth takes 8 MiB.
 const MAX_IDLE_STAGING_BYTES: u64 = 32 << 20;
-/// Read-back buffers that are kept for the next read.
+/// Maximum number of read-back buffers kept for reuse.
 const MAX_IDLE_STAGING: usize = 8;
 
 /// One GPU, real or software.
@@ -61,11 +61,11 @@ pub struct Gpu {
     live: Arc<Live>,
     peak_bytes: AtomicU64,
     next_id: AtomicU64,
-    /// Read-back buffers to use again, the oldest first.
+    /// Read-back buffers for reuse, the oldest first.
     idle_staging: Mutex<VecDeque<wgpu::Buffer>>,
 }
 
-/// Bytes of live buffers.
+/// Bytes of the buffers in use.
 #[derive(Debug, Default)]
 struct Live {
     bytes: AtomicU64,
@@ -73,7 +73,7 @@ struct Live {
 }
 
 impl Live {
-    /// Counts a new buffer; returns its label and the bytes of all.
+    /// Counts a new buffer; returns its label and the total bytes of all buffers.
     fn add(&self, label: &str, bytes: u64) -> (Arc<str>, u64) {
         let mut by_label = self.by_label.lock().unwrap_or_else(PoisonError::into_inner);
         let key = by_label.get_key_value(label).map_or_else(|| label.into(), |(key, _)| Arc::clone(key));
@@ -90,7 +90,7 @@ impl Live {
     }
 }
 
-/// What the device reports outside of any call. Neither is taken back: afterwards only another device is of use.
+/// Errors that the device reports outside of any call. They are permanent: only another device can continue.
 #[derive(Debug, Default)]
 struct Health {
     /// Why the device was lost.
@@ -116,7 +116,7 @@ impl Health {
         self.failed.get_or_init(|| failure);
     }
 
-    /// Watches a device.
+    /// Registers callbacks on a device.
     fn of(device: &wgpu::Device) -> Arc<Self> {
         let health = Arc::<Self>::default();
         let (on_loss, on_error) = (health.clone(), health.clone());
@@ -247,7 +247,7 @@ impl Gpu {
         self.live.bytes.load(Ordering::Relaxed)
     }
 
-    /// Bytes of all live buffers by their labels.
+    /// Bytes of all live buffers by label.
     pub fn live_bytes_by_label(&self) -> BTreeMap<Arc<str>, u64> {
         let by_label = self.live.by_label.lock().unwrap_or_else(PoisonError::into_inner);
         by_label.iter().filter(|(_, bytes)| **bytes > 0).map(|(label, bytes)| (Arc::clone(label), *bytes)).collect()
@@ -258,18 +258,18 @@ impl Gpu {
         self.peak_bytes.load(Ordering::Relaxed)
     }
 
-    /// Bytes that the allocator holds for buffers, used or not; `None` where the backend does not report it. Takes a moment: it
-    /// lists every allocation.
+    /// Bytes that the allocator holds for buffers, used or not; `None` if the backend does not report it. Slow: it lists every
+    /// allocation.
     pub fn reserved_bytes(&self) -> Option<u64> {
         Some(self.device.generate_allocator_report()?.total_reserved_bytes)
     }
 
-    /// Whether the device was lost: nothing that was made on it can be used any more.
+    /// Whether the device was lost. Nothing that was created on it can be used any more.
     pub fn is_lost(&self) -> bool {
         self.health.lost.get().is_some()
     }
 
-    /// An error where the device was lost, ran out of memory or rejected a command since it was opened.
+    /// Returns an error if the device was lost, ran out of memory or rejected a command since it was opened.
     pub fn check(&self) -> Result<(), Error> {
         match self.health.failed.get() {
             Some(Failure::OutOfMemory) => Err(Error::OutOfMemory { label: String::new(), bytes: 0 }),
@@ -279,12 +279,12 @@ impl Gpu {
         }
     }
 
-    /// Loses the device on purpose, as a reset of the driver does: for tests of what happens then.
+    /// Loses the device on purpose, like a driver reset; for tests of recovery.
     pub fn lose(&self) {
         self.device.destroy();
     }
 
-    /// A zeroed storage buffer; refused when the adapter cannot bind it, or has no memory left for it.
+    /// A zeroed storage buffer; an error if the adapter cannot bind it or has no memory for it.
     pub fn storage(&self, label: &str, bytes: u64) -> Result<Buffer, Error> {
         let bytes = bytes.max(16).next_multiple_of(16);
         if bytes > self.max_binding_bytes() {
@@ -368,13 +368,13 @@ impl Gpu {
         self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default())
     }
 
-    /// Submits what was encoded, with a copy of the first bytes of each of these buffers behind it: all of them in one
+    /// Submits the encoded commands, followed by a copy of the first bytes of each of these buffers. All of them share one
     /// read-back, which is one wait and one mapping.
     pub(super) fn submit_reading(&self, mut encoder: wgpu::CommandEncoder, wanted: &[(&Buffer, usize)]) -> PendingRead {
         let padded = |n_bytes: usize| n_bytes.next_multiple_of(4);
         let n_all_bytes = wanted.iter().map(|(_, n_bytes)| padded(*n_bytes) as u64).sum();
         let Some(staging) = self.staging(n_all_bytes) else {
-            self.queue.submit([encoder.finish()]); // What was encoded is done all the same.
+            self.queue.submit([encoder.finish()]); // The encoded commands still run.
             return PendingRead(Err(n_all_bytes));
         };
         let mut parts = Vec::with_capacity(wanted.len());
@@ -393,7 +393,7 @@ impl Gpu {
         PendingRead(Ok(Reading { staging, submission, mapped, parts }))
     }
 
-    /// A buffer to read back into: one that was used before where one fits; `None` where no memory is left for it.
+    /// A read-back buffer, reused if one fits; `None` if no memory is left for it.
     fn staging(&self, bytes: u64) -> Option<wgpu::Buffer> {
         let bytes = bytes.max(4);
         let mut idle = self.idle_staging.lock().unwrap_or_else(PoisonError::into_inner);
@@ -418,7 +418,7 @@ impl Gpu {
         self.idle_staging.lock().unwrap_or_else(PoisonError::into_inner).len()
     }
 
-    /// Keeps a read-back buffer for the next read, within [`MAX_IDLE_STAGING_BYTES`]; those unused longest go first.
+    /// Keeps a read-back buffer for reuse, within [`MAX_IDLE_STAGING_BYTES`]; those unused longest are dropped first.
     fn keep_staging(&self, buffer: wgpu::Buffer) {
         let mut idle = self.idle_staging.lock().unwrap_or_else(PoisonError::into_inner);
         idle.push_back(buffer);
@@ -435,7 +435,7 @@ impl Gpu {
     }
 
     fn poll(&self, until: wgpu::PollType) -> Result<(), Error> {
-        // wgpu panics where it finds out while it waits that the driver lost the device.
+        // wgpu panics if it notices a lost device while it waits.
         let polled = std::panic::catch_unwind(AssertUnwindSafe(|| self.device.poll(until)));
         match polled {
             Ok(Ok(_)) => Ok(()),
@@ -445,7 +445,7 @@ impl Gpu {
         }
     }
 
-    /// Why something failed that fails on a lost device only.
+    /// The reason for a failure that only a lost device causes.
     fn failure(&self) -> Error {
         self.check().err().unwrap_or(Error::DeviceLost)
     }
@@ -467,7 +467,7 @@ impl Gpu {
     }
 }
 
-/// A read-back under way; an error is the size of a buffer that found no memory, bytes.
+/// A read-back in progress; the error is the size in bytes of a staging buffer for which there was no memory.
 #[derive(Debug)]
 pub struct PendingRead(Result<Reading, u64>);
 
@@ -476,7 +476,7 @@ struct Reading {
     staging: wgpu::Buffer,
     submission: wgpu::SubmissionIndex,
     mapped: std::sync::mpsc::Receiver<Result<(), wgpu::BufferAsyncError>>,
-    /// Of each buffer that is read, in the staging buffer.
+    /// Range of each buffer's bytes in the staging buffer.
     parts: Vec<Range<usize>>,
 }
 
@@ -486,13 +486,13 @@ impl PendingRead {
         self.finish_with(gpu, |parts| bytemuck::pod_collect_to_vec(parts[0]))
     }
 
-    /// Waits for the data and passes the bytes of each buffer, in the order they were asked for, to `take`.
+    /// Waits for the data and passes the bytes of each buffer, in the requested order, to `take`.
     pub fn finish_with<R>(self, gpu: &Gpu, take: impl FnOnce(&[&[u8]]) -> R) -> Result<R, Error> {
         let reading = self.0.map_err(|bytes| Error::OutOfMemory { label: "readback".to_owned(), bytes })?;
         let Reading { staging, submission, mapped, parts } = reading;
         gpu.poll(wgpu::PollType::Wait { submission_index: Some(submission), timeout: None })?;
         let is_mapped = loop {
-            // Another thread that waits too may be the one that passes it on, and a lost device may never do so.
+            // Another waiting thread may run the callback, and a lost device may never do so.
             match mapped.recv_timeout(CHECK_EVERY) {
                 Ok(result) => break result.is_ok(),
                 Err(RecvTimeoutError::Timeout) => gpu.check()?,

@@ -98,7 +98,7 @@ impl Passes {
         self.list.push(Pass::Clear { buffer: buffer.raw.clone(), bytes });
     }
 
-    /// Adds a copy of some bytes from one buffer to another; offsets and number are multiples of 4.
+    /// Adds a copy of bytes from one buffer to another; offsets and length are multiples of 4.
     pub fn copy(&mut self, from: (&Buffer, u64), to: (&Buffer, u64), bytes: u64) {
         if bytes > 0 {
             self.list.push(Pass::Copy { from: (from.0.raw.clone(), from.1), to: (to.0.raw.clone(), to.1), bytes });
@@ -127,8 +127,8 @@ impl Passes {
         gpu.queue.submit([encoder.finish()]);
     }
 
-    /// Sends the list to the GPU, empties it, and begins to read the first bytes of each of these buffers as the list leaves
-    /// them: one submit and one read-back for all.
+    /// Submits the list, empties it, and begins to read the first bytes of each of these buffers as they are after the list:
+    /// one submit and one read-back for all.
     pub fn submit_reading(&mut self, gpu: &Gpu, wanted: &[(&Buffer, usize)]) -> PendingRead {
         let mut encoder = gpu.encoder();
         encode_all(&mut encoder, self.list.drain(..));
@@ -284,7 +284,7 @@ mod tests {
         let second = gpu.storage_with("second", bytemuck::cast_slice(&[0.5f32; 1000])).unwrap();
         let mut list = Passes::default();
         for n in [3, 1000, 2, 1000] {
-            // A copy within the list comes before the read.
+            // A copy in the list happens before the read.
             list.copy((&second, 0), (&first, 4), 4);
             let read = list.submit_reading(&gpu, &[(&first, 7), (&second, 4 * n)]);
             assert!(list.is_empty());

@@ -57,7 +57,7 @@ pub struct NerfModel {
     /// Steps of trials that were taken back.
     n_taken_back: u64,
     step_millis: f64,
-    /// Whether pictures are asked for.
+    /// Whether pictures are requested.
     is_watched: bool,
 }
 

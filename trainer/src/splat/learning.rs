@@ -162,7 +162,7 @@ fn learns_unseen_views_and_gives_the_same_bits_twice() {
     assert!(run(2).2 != arrays, "the seed has no effect: the comparison cannot fail");
 }
 
-/// On a software adapter images leave the GPU again: memory stays bounded however many keyframes there are.
+/// On a software adapter, images are removed from the GPU: memory stays bounded however many keyframes there are.
 #[test]
 fn a_bound_on_images_holds_and_changes_no_bit() {
     const LEVEL_0_BYTES: u64 = 8 * SIZE_PX[0] as u64 * SIZE_PX[1] as u64;
@@ -188,12 +188,12 @@ fn a_bound_on_images_holds_and_changes_no_bit() {
     let max_bytes = 3 * LEVEL_0_BYTES;
     let (bounded_bytes, bounded_live, bounded) = run(max_bytes, train_one_by_one);
     assert!((1..=max_bytes).contains(&bounded_bytes), "{bounded_bytes} bytes of images");
-    // Longer submits have somewhat larger buffers of their own; no image is that small.
+    // Buffers of longer submits are slightly larger; the difference is less than any image.
     let unexplained = (live_bytes - bounded_live).abs_diff(image_bytes - bounded_bytes);
-    assert!(unexplained < LEVEL_0_BYTES / 4, "images that left were not freed: {unexplained} bytes");
+    assert!(unexplained < LEVEL_0_BYTES / 4, "removed images were not freed: {unexplained} bytes");
     assert!(bounded == arrays, "the bound changed what is learned");
 
-    // A submit of many steps needs more images at once than fit.
+    // A submit of many steps needs more images than fit within the bound.
     let (_, _, bounded) = run(max_bytes, train_in_long_submits);
     assert!(bounded == arrays, "the bound changed what is learned in long submits");
 }
@@ -369,7 +369,7 @@ fn scratch_memory_grows_when_a_view_needs_more() {
     for keyframe in &keyframes[1..4] {
         trainer.push(Arc::new(Keyframe { depth: None, ..keyframe.as_ref().clone() })).unwrap();
     }
-    // Before there is any memory for it: what is read back is of the attempt that found room.
+    // The buffers are too small at first: the data read back must be that of the attempt that had enough room.
     let large = RenderRequest { size_px: [640, 480], ..request(pose(0)) };
     let [first, second] = [0, 1].map(|_| trainer.render(&large).unwrap());
     assert!(first.rgba_srgb == second.rgba_srgb && first.depth_m == second.depth_m);
@@ -426,7 +426,7 @@ fn the_length_of_submits_changes_no_bit() {
     assert!(learned(train_in_long_submits) == learned(train_one_by_one));
 }
 
-/// Nor does anybody who looks: submits are shorter then, and images come to the GPU in smaller batches.
+/// Viewers change no bit either: submits are shorter then, and images are uploaded in smaller batches.
 #[test]
 fn submits_are_short_while_somebody_looks_and_no_bit_differs() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();

@@ -10,7 +10,7 @@ use kinematics::Transform;
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 use std::f64::consts::{FRAC_PI_2, PI};
 
-/// Draws what is asked for with `draw`, which knows pinhole cameras and gives their pictures depth where the request wants it.
+/// Draws the request with `draw`, which draws pinhole cameras and adds depth if the request wants it.
 pub(crate) fn render(
     request: &RenderRequest,
     mut draw: impl FnMut(&Camera) -> Result<Picture, Error>,

@@ -38,11 +38,11 @@ const GROWTH_END_FRAC: f64 = 0.75;
 const SH_PERIOD: u64 = 300;
 /// Most steps of a submit.
 const MAX_STEPS_PER_SUBMIT: u64 = 64;
-/// Most bytes of images that a software adapter holds: its memory is the host's, which holds all keyframes already.
+/// Maximum bytes of images on a software adapter: its memory is the host's, which already holds all keyframes.
 const SOFTWARE_IMAGE_BYTES: u64 = 256 << 20;
-/// Images that are made at once where all views are looked at in turn.
+/// Number of images made at once when all views are needed in turn.
 const VIEWS_AT_ONCE: usize = 16;
-/// Views whose images are made and uploaded at once while pictures are asked for: with more of them a picture waits too long.
+/// Views whose images are made and uploaded at once while pictures are requested: with more, a picture would wait too long.
 const VIEWS_AT_ONCE_WATCHED: u64 = 4;
 /// Readings further than this from the rendered depth are outliers.
 const DEPTH_CLIP_M: f64 = 0.2;
@@ -87,9 +87,9 @@ pub struct SplatTrainer {
     seeds_per_image: f64,
     coarse_steps: [u64; 2],
     views: Vec<TrainView>,
-    /// Most bytes of their images on the GPU, unless a submit needs more.
+    /// Maximum bytes of their images on the GPU, unless a submit needs more.
     max_image_bytes: u64,
-    /// How often images were asked for.
+    /// How often images were requested.
     images_asked: u64,
     order: Order,
     scene_size_m: f64,
@@ -100,25 +100,25 @@ pub struct SplatTrainer {
     /// Step from which the planned steps count: late keyframes set it forward.
     schedule_start: u64,
     grown_at: u64,
-    /// Whether the GPU had no memory for more splats.
+    /// Whether the GPU has no memory for more splats.
     is_full: bool,
     n_poisoned: u64,
     in_flight: Option<InFlight>,
     idle_since: Instant,
     step_millis: f64,
-    /// Whether pictures are asked for.
+    /// Whether pictures are requested.
     is_watched: bool,
-    /// The image that a picture was last compared with, to be used again.
+    /// Buffer of the image of the last comparison, for reuse.
     compared: Option<Buffer>,
 }
 
-/// What of a picture is read back.
+/// The parts of a picture that are read back.
 #[derive(Clone, Copy, Debug)]
 enum Wanted<'a> {
     Nothing,
     Color,
     ColorAndDepth,
-    /// How it compares with an image: the sums of `score.wgsl`.
+    /// The sums of `score.wgsl` for a comparison with an image.
     Comparison {
         score: &'a Pipeline,
         image: &'a Buffer,
@@ -155,7 +155,7 @@ impl Drop for Compiling {
     }
 }
 
-/// All that learning changes, to restore it later. No keyframe waits for its splats when a state is taken.
+/// Everything that training changes, for restoring it later. When a state is taken, no keyframe waits for its splats.
 #[derive(Debug)]
 pub(crate) struct State {
     pub(super) splats: SplatBuffers,
@@ -165,7 +165,7 @@ pub(crate) struct State {
     pub(super) seeding: Seeding,
 }
 
-/// What keyframes change when they arrive: places that have splats, and the scale and schedule of learning.
+/// What an arriving keyframe changes: places that have splats, and the scale and schedule of training.
 #[derive(Clone, Debug)]
 pub(crate) struct Seeding {
     pub(super) seeder: Seeder,
@@ -313,7 +313,7 @@ impl SplatTrainer {
         self.step_millis = millis;
     }
 
-    /// Bounds the images on the GPU as on a software adapter.
+    /// Bounds the images on the GPU, as on a software adapter.
     #[cfg(test)]
     pub(super) fn hold_images(&mut self, max_bytes: u64) {
         self.max_image_bytes = max_bytes;
@@ -329,7 +329,7 @@ impl SplatTrainer {
         self.gpu.read::<u32>(&self.learn_status, status::LEN).unwrap()[status::STEP].into()
     }
 
-    /// Places that count as seeded.
+    /// Number of places that count as seeded.
     #[cfg(test)]
     pub(super) fn n_seeds(&self) -> usize {
         self.seeder.n_seeds()
@@ -375,7 +375,7 @@ impl SplatTrainer {
         Ok(())
     }
 
-    /// Makes room for so many splats; where the GPU has no memory for them, says how many there is room for.
+    /// Makes room for this many splats; if the GPU has no memory for them, returns how many there is room for.
     fn room_for(&mut self, n_splats: u32) -> Result<u32, Error> {
         if self.is_full {
             return Ok(n_splats.min(self.splats.capacity));
@@ -395,7 +395,7 @@ impl SplatTrainer {
         if n_splats > self.splats.capacity {
             let capacity =
                 n_splats.max(self.splats.capacity.saturating_mul(3) / 2).min(self.options.cap().max(n_splats));
-            // Before the model itself: it must be possible to draw whatever there is room for.
+            // Before the model itself, because every model that fits must also be drawable.
             let have = self.scratch.as_ref().map(|(size, _)| *size);
             if let Some(have) = have {
                 let n_entries = have.n_entries.max(2 * capacity);
@@ -507,7 +507,7 @@ impl SplatTrainer {
         self.gpu.write(&self.rule, 0, bytemuck::bytes_of(&rule));
     }
 
-    /// Uploads the images that the next `n` steps need and the GPU does not hold.
+    /// Uploads the images that the next `n` steps need and that are not on the GPU.
     fn prepare_levels(&mut self, n: u64) -> Result<(), Error> {
         let mut wanted = self.looked_at(n);
         let all_there = wanted.iter().all(|(view_ix, level)| self.views[*view_ix].has_level(*level));
@@ -528,7 +528,7 @@ impl SplatTrainer {
         looked_at
     }
 
-    /// Uploads these levels of views where the GPU does not hold them, made on all processors; others may have to make room.
+    /// Uploads these levels of views unless they are on the GPU, using all processors; other images may be removed for them.
     fn make_levels(&mut self, wanted: &BTreeSet<(usize, usize)>) -> Result<(), Error> {
         let missing: Vec<(usize, usize)> =
             wanted.iter().copied().filter(|(view_ix, level)| !self.views[*view_ix].has_level(*level)).collect();
@@ -545,7 +545,7 @@ impl SplatTrainer {
             };
             let mut dropped = views::drop_levels(&mut self.views, keep);
             if !dropped.is_empty() && !self.passes.is_empty() {
-                self.passes.submit(&self.gpu); // What is listed needs the images that are replaced.
+                self.passes.submit(&self.gpu); // The listed passes need the images that are replaced.
             }
             for ((view_ix, level), images) in missing.into_iter().zip(&made) {
                 let same_size = dropped.iter().position(|level| level.size_px == images.size_px());
@@ -605,7 +605,7 @@ impl SplatTrainer {
         Ok(level_ix)
     }
 
-    /// Makes the buffers that learning from a view at a level needs, without its images.
+    /// Makes the buffers for training on a view at a level, without its images.
     fn make_space(&mut self, view_ix: usize, level_ix: usize) -> Result<(), Error> {
         let size_px = self.views[view_ix].size_at(level_ix);
         self.make_scratch(size_px, true)?;
@@ -865,12 +865,12 @@ impl SplatTrainer {
         self.begin_learning()
     }
 
-    /// A trial takes copies of the model; where there is no memory for them the model learns as it is.
+    /// Trials need copies of the model. If there is no memory for them, training continues without trials.
     fn end_trials_without_memory(&mut self, error: Error) -> Result<(), Error> {
         if !error.is_of_memory() {
             return Err(error);
         }
-        log::warn!("no more changes of the model are tried: {error}");
+        log::warn!("no further trials of model changes: {error}");
         self.join_held_back()
     }
 
@@ -892,7 +892,7 @@ impl SplatTrainer {
         self.begin_learning()
     }
 
-    /// Restores the state without the change where the change is rejected, then learns from what arrived meanwhile.
+    /// Restores the state without the change if the change is rejected, then adds the keyframes that arrived meanwhile.
     fn end_trial(&mut self, Ended { restored, seeded, deferred }: Ended) -> Result<(), Error> {
         if let Some(state) = restored {
             self.go_back(state)?;
@@ -901,9 +901,9 @@ impl SplatTrainer {
         deferred.into_iter().try_for_each(|keyframe| self.welcome(keyframe))
     }
 
-    /// Learns from a keyframe that arrives now.
+    /// Starts training on a keyframe that arrives now.
     fn welcome(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
-        // What comes late finds at least half of the plan ahead of it: rates that still move things, and growth.
+        // At least half of the schedule is ahead of a late keyframe: learning rates are still large enough, and growth continues.
         self.schedule_start = self.schedule_start.max(self.step.saturating_sub(self.options.n_planned_steps / 2));
         self.learn_from(keyframe)
     }
@@ -932,8 +932,8 @@ impl SplatTrainer {
         self.draw_reading(camera, background_srgb, shown, Wanted::Nothing, |_| ())
     }
 
-    /// Draws one pinhole view into the frame for pictures and passes the bytes of what is wanted of it to `take`. Counters,
-    /// which say whether all intersections found room, come back in the same read; where they did not, it is drawn again.
+    /// Draws one pinhole view into the frame for pictures and passes the bytes of the wanted parts to `take`. The same read
+    /// returns counters that report whether all intersections had room; if not, the view is drawn again.
     fn draw_reading<R>(
         &mut self,
         camera: &Camera,
@@ -1007,7 +1007,7 @@ impl Method for SplatTrainer {
             self.trials.held_back.push(HeldBack { keyframe, image: None });
             return Ok(());
         }
-        // Both halves of a trial learn from the same keyframes at the same steps.
+        // Both halves of a trial train on the same keyframes at the same steps.
         if self.trials.defers(&keyframe, self.step) {
             return Ok(());
         }

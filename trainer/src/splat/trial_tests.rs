@@ -1,4 +1,4 @@
-//! Trials while keyframes come and go: both halves see the same data, no seed is lost, and a checkpoint holds all of it.
+//! Trials while keyframes arrive and leave: both halves see the same data, no seed is lost, and a checkpoint holds the whole trial.
 
 use super::learning::{n_keyframes, options};
 use super::trials::{MAX_SCORED, TRIAL_START};
@@ -8,12 +8,12 @@ use crate::gpu::{Gpu, GpuOptions};
 use crate::{Keyframe, Method, Split};
 use std::sync::Arc;
 
-/// Steps of each half of a trial of what all images share.
+/// Steps of each half of a trial of parameters that all images share.
 const HALF: u64 = 250;
 const END: u64 = TRIAL_START + 2 * HALF;
 
 fn trying(gpu: &Arc<Gpu>, candidate: TermSet) -> SplatTrainer {
-    // The splat count changes with seeds alone.
+    // The splat count changes only when seeds are added.
     let options = SplatOptions {
         cameras: CameraChoice::Try(vec![candidate]),
         growth_frac: 0.0,
@@ -29,7 +29,7 @@ fn with_split(keyframe: &Arc<Keyframe>, split: Split) -> Arc<Keyframe> {
     Arc::new(Keyframe { split, ..keyframe.as_ref().clone() })
 }
 
-/// Trains until so many updates were made in all, trials included.
+/// Trains up to a total number of updates, including those of trials.
 fn train_to(trainer: &mut SplatTrainer, n_taken: u64) {
     while trainer.n_taken().unwrap() < n_taken {
         let left = n_taken - trainer.n_taken().unwrap();
@@ -43,13 +43,13 @@ fn lens() -> TermSet {
 
 const N_EARLY: usize = 30;
 
-/// Keyframes all around, every fourth of them held back.
+/// Keyframes all around the scene; every fourth one is a selection keyframe.
 fn around(gpu: &Arc<Gpu>) -> Vec<Arc<Keyframe>> {
     let split = |ix: usize| if ix.is_multiple_of(4) { Split::Selection } else { Split::Train };
     n_keyframes(gpu, 46, true).iter().enumerate().map(|(ix, keyframe)| with_split(keyframe, split(ix))).collect()
 }
 
-/// Keyframes arrive before the trial, in its first half and in its second; the trial is over afterwards.
+/// Keyframes arrive before the trial, in its first half and in its second half; returns after the end of the trial.
 fn trial_with_arrivals(gpu: &Arc<Gpu>, candidate: TermSet, keyframes: &[Arc<Keyframe>]) -> SplatTrainer {
     let (early, late) = keyframes.split_at(N_EARLY);
     let (first_half, second_half) = late.split_at(8);
@@ -82,7 +82,7 @@ fn a_change_without_effect_scores_the_same_while_keyframes_arrive() {
         panic!("{:?}", trainer.trials())
     };
     assert_eq!((*gain_db, *standard_error_db, *kept), (0.0, 0.0, false));
-    assert_eq!(*n_images, N_EARLY.div_ceil(4), "those that were there when it began");
+    assert_eq!(*n_images, N_EARLY.div_ceil(4), "those held when the trial began");
     assert_no_seed_is_lost(&trainer, &keyframes);
 }
 
@@ -112,7 +112,7 @@ fn both_scores_of_a_trial_are_of_the_same_images() {
     let mut trainer = trying(&gpu, TermSet::NONE);
     let (early, late) = selection.split_at(N_FIRST);
     train.chain(early.iter().cloned()).for_each(|keyframe| trainer.push(keyframe).unwrap());
-    // More of them come than a score is the mean over, in both halves; and two of those that were scored go.
+    // In both halves, more keyframes arrive than are scored, and two of the scored ones are removed.
     for (ix, keyframe) in late.iter().enumerate() {
         train_to(&mut trainer, TRIAL_START + 10 + 24 * ix as u64);
         trainer.push(keyframe.clone()).unwrap();
@@ -134,12 +134,12 @@ fn both_scores_of_a_trial_are_of_the_same_images() {
 fn stopping_in_either_half_of_a_trial_changes_no_bit() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = n_keyframes(&gpu, 42, true);
-    // Steps at which keyframes arrive, and at which training stops and goes on; all count updates in all.
+    // Times at which keyframes arrive, and at which training stops and resumes, in total updates.
     let arrivals: Vec<u64> = (0..42).map(|ix| if ix < 36 { 0 } else { TRIAL_START - 60 + 120 * (ix - 35) }).collect();
     let stops = [TRIAL_START - 10, TRIAL_START + 70, TRIAL_START + HALF + 30, TRIAL_START + HALF + 140, END + 20];
     let run = |stops: &[u64]| {
         let mut trainer = trying(&gpu, lens());
-        let mut n_taken_before = 0; // Updates that a trial took back are not in a checkpoint.
+        let mut n_taken_before = 0; // A checkpoint does not count updates that a trial reverted.
         let mut n_pushed = 0;
         let times: std::collections::BTreeSet<u64> = arrivals.iter().chain(stops).copied().chain([END + 40]).collect();
         for time in times {

@@ -1,7 +1,7 @@
 //! Whether a part of the model pays: tried on a copy of the model, judged by images not learned from.
 //!
 //! At the start the selection keyframes are held back. Each candidate gets as many steps as the model without it, from
-//! the same state. Keyframes that arrive meanwhile reach both at the same step, or wait until the trial has ended.
+//! the same state. Keyframes that arrive meanwhile reach both at the same step, or wait for the end of the trial.
 //! What is added stays when the paired gain on the selection keyframes exceeds both a least gain and two
 //! standard errors; what is left out stays out when that costs less than a least gain, half a standard error counted in,
 //! and all of it together no more than [`MOST_SPENT_DB`]. When all is settled the selection keyframes are learned from, too.
@@ -29,7 +29,7 @@ const LEAST_GAIN_OF_DOUBLING_DB: f64 = 0.1;
 const MOST_SPENT_DB: f64 = 0.15;
 /// Fewer selection keyframes tell nothing.
 const LEAST_IMAGES: usize = 4;
-/// Most selection keyframes that a score is the mean over.
+/// Maximum number of selection keyframes in a mean score.
 pub(crate) const MAX_SCORED: usize = 24;
 /// Fewer splats are not divided further.
 const FEWEST_SPLATS: u32 = 1000;
@@ -181,19 +181,19 @@ pub(crate) struct HeldBack {
 /// Camera and stamp of a keyframe.
 pub(crate) type ImageId = (Arc<str>, Stamp);
 
-/// PSNR of selection keyframes, dB.
+/// PSNR of each selection keyframe, dB.
 pub(crate) type Scores = BTreeMap<ImageId, f64>;
 
 fn id_of(keyframe: &Keyframe) -> ImageId {
     (keyframe.camera.clone(), keyframe.stamp)
 }
 
-/// Scores of the images that both hold.
+/// Scores of the images that are in both.
 fn paired(without_db: &Scores, with_db: &Scores) -> (Vec<f64>, Vec<f64>) {
     without_db.iter().filter_map(|(id, without)| Some((*without, *with_db.get(id)?))).unzip()
 }
 
-/// A training keyframe that arrived during a trial, and the step at which it did.
+/// A training keyframe that arrived during a trial, and the step of its arrival.
 #[derive(Clone, Debug)]
 pub(crate) struct Arrival {
     pub(crate) step: u64,
@@ -238,41 +238,41 @@ enum Phase {
     Settled,
 }
 
-/// A trial under way.
+/// A trial in progress.
 #[derive(Debug)]
 pub(crate) struct Running {
     pub(crate) candidate: Candidate,
     /// Last step of this half.
     pub(crate) until: u64,
-    /// The state that does not learn now: where the trial began in the first half, the end of the first half in the second.
+    /// The state not in training: during the first half the start of the trial, during the second half the end of the first.
     pub(crate) other: Box<State>,
     /// The selection keyframes that both halves are scored on.
     pub(crate) scored: Vec<ImageId>,
-    /// In the first half keyframes that arrived; in the second those that have yet to arrive again.
+    /// In the first half, the keyframes that arrived; in the second half, those that have yet to arrive again.
     pub(crate) arrivals: VecDeque<Arrival>,
 }
 
-/// The second half of a trial begins.
+/// What to do at the start of the second half of a trial.
 pub(crate) struct Turned {
     /// The state to restore.
     pub(crate) from: State,
-    /// What to change there.
+    /// The change to apply to it.
     pub(crate) candidate: Candidate,
-    /// Keyframes to forget: they arrive again.
+    /// Keyframes to remove, because they arrive again.
     pub(crate) arrived: Vec<Arc<Keyframe>>,
 }
 
-/// A trial has ended.
+/// What to do at the end of a trial.
 pub(crate) struct Ended {
-    /// The state to restore, where the change is rejected.
+    /// The state to restore if the change is rejected.
     pub(crate) restored: Option<State>,
-    /// Keyframes that the restored state has splats of and the other one does not know yet.
+    /// Keyframes that already have splats in the restored state but are not views yet.
     pub(crate) seeded: Vec<Arc<Keyframe>>,
-    /// Keyframes to learn from now.
+    /// Keyframes to add now.
     pub(crate) deferred: Vec<Arc<Keyframe>>,
 }
 
-/// A trial under way, for a checkpoint: its second half where there are scores of the first.
+/// A trial in progress, for a checkpoint; it is in its second half if it has scores of the first.
 pub(crate) type UnderWay<'a> = (&'a Running, Option<&'a Scores>);
 
 /// What is still to be tried.
@@ -294,7 +294,7 @@ pub(crate) enum Due {
     Begin(Candidate),
     /// Score; go back to the copy; change what is tried.
     Turn,
-    /// Learn from a keyframe that arrived at this step of the first half.
+    /// Add a keyframe that arrived at this step of the first half.
     Arrival,
     /// Score; decide.
     End,
@@ -341,7 +341,7 @@ impl Trials {
         matches!(self.count, Count::ToCap | Count::Growing) && !is_halving
     }
 
-    /// The trial under way.
+    /// The trial in progress.
     pub(crate) fn under_way(&self) -> Option<UnderWay<'_>> {
         match &self.phase {
             Phase::Without(trial) => Some((trial, None)),
@@ -398,7 +398,7 @@ impl Trials {
         }
     }
 
-    /// Takes note of a keyframe to learn from that arrives at a step, and says whether it has to wait for the end of a trial.
+    /// Records a training keyframe that arrives at this step; returns whether it has to wait for the end of a trial.
     pub(crate) fn defers(&mut self, keyframe: &Arc<Keyframe>, step: u64) -> bool {
         match &mut self.phase {
             Phase::Without(trial) => {
@@ -413,7 +413,7 @@ impl Trials {
         }
     }
 
-    /// The keyframe that arrives now in the second half of a trial.
+    /// The keyframe that is due to arrive now in the second half of a trial.
     pub(crate) fn next_arrival(&mut self) -> Option<Arc<Keyframe>> {
         match &mut self.phase {
             Phase::With { trial, .. } => trial.arrivals.pop_front().map(|arrival| arrival.keyframe),
@@ -421,14 +421,14 @@ impl Trials {
         }
     }
 
-    /// The selection keyframes that a score is the mean over: those of the trial under way, else some spread over all.
+    /// The selection keyframes to score: those of the trial in progress, otherwise some that are spread over all.
     pub(crate) fn scored(&self) -> Vec<ImageId> {
         let stride = self.held_back.len().div_ceil(MAX_SCORED).max(1);
         let spread = || self.held_back.iter().step_by(stride).map(|held_back| id_of(&held_back.keyframe)).collect();
         self.under_way().map_or_else(spread, |(trial, _)| trial.scored.clone())
     }
 
-    /// A selection keyframe that is still held back.
+    /// A selection keyframe, unless it was evicted.
     pub(crate) fn held_back(&mut self, (camera, stamp): &ImageId) -> Option<&mut HeldBack> {
         let is_it =
             |held_back: &&mut HeldBack| held_back.keyframe.camera == *camera && held_back.keyframe.stamp == *stamp;
@@ -465,7 +465,7 @@ impl Trials {
         }
     }
 
-    /// Judges the change.
+    /// Accepts or rejects the change.
     pub(crate) fn end(&mut self, with_db: &Scores) -> Option<Ended> {
         let Phase::With { trial, without_db, deferred } = std::mem::replace(&mut self.phase, Phase::Waiting) else {
             return None;
@@ -500,7 +500,7 @@ impl Trials {
         kept
     }
 
-    /// Gives up what is being tried; it is tried again where training goes on.
+    /// Cancels the trial in progress; it is repeated if training continues.
     pub(crate) fn give_up(&mut self) -> Option<Ended> {
         match std::mem::replace(&mut self.phase, Phase::Waiting) {
             Phase::With { trial, deferred, .. } => Some(Ended {
@@ -529,7 +529,7 @@ impl Trials {
         }
     }
 
-    /// What a checkpoint has to hold beside a trial under way.
+    /// What a checkpoint has to hold besides a trial in progress.
     pub(crate) fn untried(&self) -> Untried {
         Untried {
             is_settled: !self.hold_back(),
@@ -546,7 +546,7 @@ impl Trials {
         (self.count, self.degree, self.ended) = (untried.count, untried.degree, ended);
     }
 
-    /// Goes on with a trial that a checkpoint holds; it is in its second half where there are scores of the first.
+    /// Continues a trial from a checkpoint; it is in its second half if there are scores of the first.
     pub(crate) fn restore_trial(&mut self, trial: Running, without_db: Option<Scores>) {
         self.phase = match without_db {
             Some(without_db) => Phase::With { trial, without_db, deferred: Vec::new() },

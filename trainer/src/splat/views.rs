@@ -75,27 +75,27 @@ pub(crate) struct Level {
 }
 
 impl Level {
-    /// GPU memory of the images.
+    /// GPU memory of the images, bytes.
     fn bytes(&self) -> u64 {
         self.image.bytes() + self.depth.bytes()
     }
 }
 
-/// Which images stay on the GPU.
+/// Which images to keep on the GPU.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Keep<'a> {
-    /// Views and levels that the next steps need; they stay whatever their size.
+    /// Views and levels that the next steps need; they are kept whatever their size.
     pub(crate) needed: &'a BTreeSet<(usize, usize)>,
-    /// Levels coarser than this are no longer learned from.
+    /// Coarser levels are no longer used for training.
     pub(crate) coarsest: u32,
-    /// Most bytes of the images that stay.
+    /// Maximum total bytes of the images that are kept.
     pub(crate) max_bytes: u64,
 }
 
 /// Removes images from the GPU and returns their buffers for reuse.
 ///
-/// Images at a resolution that training has passed go first. If the rest is still larger than `max_bytes`, the images used last
-/// go next: every view is used once per round, so the others are needed sooner.
+/// Images at a resolution that training has passed are removed first. If the rest is still larger than `max_bytes`, the most
+/// recently used images are removed next: every view is used once per round, so the others are needed sooner.
 pub(crate) fn drop_levels(views: &mut [TrainView], keep: Keep<'_>) -> Vec<Level> {
     let mut dropped = Vec::new();
     let mut candidates = Vec::new();
@@ -155,7 +155,7 @@ impl TrainView {
         self.keyframe.size_px.map(|px| (px >> level).max(1))
     }
 
-    /// GPU memory of its images.
+    /// GPU memory of its images, bytes.
     #[cfg(test)]
     pub(crate) fn image_bytes(&self) -> u64 {
         self.levels.iter().flatten().map(Level::bytes).sum()
@@ -165,14 +165,14 @@ impl TrainView {
         self.levels[level].is_some()
     }
 
-    /// Notes that a level is needed at `now`, a count that grows.
+    /// Records that a level is needed at time `now`, a counter.
     pub(crate) fn touch(&mut self, level: usize, now: u64) {
         if let Some(level) = &mut self.levels[level] {
             level.used_at = now;
         }
     }
 
-    /// Uploads the images of a level, into the buffers of a dropped level of the same size where there is one.
+    /// Uploads the images of a level, reusing the buffers of a dropped level of the same size if there is one.
     pub(crate) fn upload(
         &mut self,
         gpu: &Gpu,
@@ -197,7 +197,7 @@ impl TrainView {
                 view: gpu.uniform_with("splat.view", &view),
                 image: gpu.storage_with("splat.target_image", &images.image)?,
                 depth: match depth_bytes {
-                    // A new buffer is zero: nothing is known anywhere.
+                    // A new buffer is zeroed: no depth is known.
                     [] => gpu.storage("splat.target_depth", 4 * u64::from(size_px[0]) * u64::from(size_px[1]))?,
                     _ => gpu.storage_with("splat.target_depth", depth_bytes)?,
                 },
@@ -208,12 +208,12 @@ impl TrainView {
     }
 }
 
-/// A keyframe made smaller, in host memory; at full size its pixels are the keyframe's own.
+/// A keyframe at a lower resolution, in host memory; at full size it shares the keyframe's pixels.
 #[derive(Debug)]
 pub(crate) struct LevelImages {
     camera: Camera,
     image: Arc<[u8]>,
-    /// Empty where the keyframe has no depth.
+    /// Empty if the keyframe has no depth.
     depth_m: Arc<[f32]>,
 }
 
@@ -227,7 +227,7 @@ impl LevelImages {
         Self { camera, image, depth_m }
     }
 
-    /// GPU memory that the images take.
+    /// GPU memory that the images need, bytes.
     pub(crate) fn bytes(&self) -> u64 {
         (self.image.len() + size_of_val(&*self.depth_m)) as u64
     }
@@ -289,8 +289,8 @@ fn shrunk_image(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[u8]>
     shrunk.into()
 }
 
-/// The reading at the middle of each square: means would invent surfaces between near and far. Empty for a keyframe without
-/// depth.
+/// Takes the value in the middle of each square, because averages would invent surfaces between near and far. Empty for a
+/// keyframe without depth.
 fn shrunk_depth(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[f32]> {
     let full = depth_in_color_view(keyframe);
     if full.is_empty() || level == 0 {

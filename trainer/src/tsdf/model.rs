@@ -69,7 +69,7 @@ pub struct TsdfModel {
     n_on_gpu: u32,
     step: u64,
     step_millis: f64,
-    /// Whether pictures are asked for.
+    /// Whether pictures are requested.
     is_watched: bool,
 }
 
@@ -194,7 +194,7 @@ impl TsdfModel {
         Ok(())
     }
 
-    /// Keyframes of a submit that takes no longer than it may.
+    /// Number of keyframes in a submit that stays within the time limit.
     fn frames_per_submit(&self) -> usize {
         if !self.is_watched || self.step_millis == 0.0 {
             return FRAMES_PER_SUBMIT;

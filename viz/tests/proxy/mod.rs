@@ -1,4 +1,4 @@
-//! A TCP proxy whose link can be cut: connections stay open, and nothing passes until it is mended.
+//! A TCP proxy whose link can be cut: connections stay open, but nothing passes until the link is restored.
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-/// Its threads end with the process or with their connections.
+/// Its threads end with the process or their connections.
 pub(crate) struct Proxy {
     address: SocketAddr,
     is_cut: Arc<AtomicBool>,
@@ -54,7 +54,7 @@ fn pump(mut from: TcpStream, mut to: TcpStream, is_cut: &AtomicBool) {
             std::thread::sleep(Duration::from_millis(5));
         }
         if n == 0 || to.write_all(&bytes[..n]).is_err() {
-            // Closing an end that the other side has closed already fails, and need not succeed.
+            // Fails if the other side has already closed this end, which is fine.
             let _ = to.shutdown(Shutdown::Both);
             return;
         }

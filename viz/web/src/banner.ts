@@ -1,4 +1,4 @@
-// One line across the view: what stands between the operator and a live picture, or how the run ended.
+// One line across the view: why the picture is not live, or how the run ended.
 
 import { timeText } from "./chart";
 import type { ConnectionState } from "./connection";
@@ -28,11 +28,11 @@ export class Banner {
 
   private show(): void {
     const isBroken = this.connection === "silent" || this.connection === "lost";
-    // After the end of a run, a stopped server is what everybody expects.
+    // Once a run has ended, a stopped server is expected.
     const { ended, isFinished } = this;
     const text = ended ? endedText(ended) : isBroken ? capitalized(this.connectionText) : "";
     const banner = element("banner");
-    if (banner.textContent !== text) banner.textContent = text; // Else screen readers would repeat it.
+    if (banner.textContent !== text) banner.textContent = text; // Otherwise screen readers would repeat it.
     banner.dataset.kind = isFinished ? "finished" : this.connection;
     element("view").classList.toggle("stale", isBroken && !isFinished);
   }

@@ -1,21 +1,21 @@
-// The WebSocket: opens it, notices when it is silent, opens it again when it breaks, hands messages on.
+// The WebSocket: opens it, detects silence, reopens it after a failure, and passes messages on.
 
 import { type BinaryHeader, type ClientMessage, PROTOCOL_VERSION, type TextMessage, unframe } from "./protocol";
 import { ServerClock } from "./server_clock";
 
 const CHECK_MILLIS = 100;
 const PING_MILLIS = 500;
-/** The server sends a heartbeat four times a second; longer silence means that something is wrong. */
+/** The server sends a heartbeat four times a second; a longer silence indicates a problem. */
 const SILENT_MILLIS = 800;
-/** After this much silence, another connection is tried. */
+/** After this much silence, the page reconnects. */
 const GIVE_UP_MILLIS = 4000;
-/** An attempt that brings no message within this time is given up. */
+/** An attempt that brings no message within this time is abandoned. */
 const ATTEMPT_MILLIS = 2000;
-/** Pauses before the next attempts; a server on this computer or behind a tunnel is back within a second. */
+/** Pauses before the next attempts. A server on this computer or behind a tunnel is usually back within a second. */
 const RETRY_MILLIS = [250, 500, 1000];
-/** After a check this late, messages may be waiting that prove that the server is there: they are handled first. */
+/** If a check is this late, messages that prove the server alive may be queued; they are handled first. */
 const LATE_MILLIS = 400;
-/** A check this late means that the page or the computer slept. */
+/** If a check is this late, the page or the computer was suspended. */
 const SUSPENDED_MILLIS = 5000;
 
 export type ConnectionState = "connecting" | "open" | "silent" | "lost";
@@ -59,7 +59,7 @@ export class Connection {
   private open(): void {
     const socket = new WebSocket(this.url);
     socket.binaryType = "arraybuffer";
-    // Speaking at once shows the server that somebody is here: silent clients give way to new ones.
+    // A first message shows the server that the client is in use: silent clients are replaced by new ones.
     socket.onopen = () => this.ping();
     socket.onmessage = (event) => {
       if (socket === this.socket) this.receive(event.data as string | ArrayBuffer);
@@ -72,7 +72,7 @@ export class Connection {
     this.clock.forget();
   }
 
-  /** Gives the socket up; a new one follows after a pause. */
+  /** Abandons the socket; a new one is opened after a pause. */
   private lose(): void {
     const socket = this.socket;
     this.socket = null;
@@ -145,7 +145,7 @@ export class Connection {
       case "hello":
         this.goodbye = "";
         if (message.protocol !== PROTOCOL_VERSION) {
-          this.goodbye = "this page is of another version than the server, reload it";
+          this.goodbye = "this page and the server have different versions, reload the page";
           this.lose();
           return;
         }

@@ -4,9 +4,9 @@ import { element } from "./element";
 import type { LiveImageHeader } from "./protocol";
 import type { ServerClock } from "./server_clock";
 
-/** Nothing older is called live. */
+/** Older images are not labeled live. */
 const LIVE_MILLIS = 500;
-/** An older image is dimmed. */
+/** Older images are dimmed. */
 const DIM_MILLIS = 2000;
 
 interface Slot {
@@ -26,7 +26,7 @@ export class LiveImages {
     window.setInterval(() => this.showAges(), 100);
   }
 
-  /** Shows an image, unless a newer one of its camera comes before it is decoded. */
+  /** Shows an image, unless a newer one of its camera arrives before it is decoded. */
   show(header: LiveImageHeader, jpeg: Uint8Array<ArrayBuffer>): void {
     const slot = this.slots.get(header.camera) ?? this.add(header.camera);
     slot.waiting = { header, jpeg };
@@ -52,7 +52,7 @@ export class LiveImages {
     slot.isDecoding = false;
   }
 
-  /** A new server has a new clock: what is shown is from before. */
+  /** Marks all images as not live: a new server has a new clock. */
   forget(): void {
     for (const slot of this.slots.values()) slot.capturedMillis = -Infinity;
     this.showAges();

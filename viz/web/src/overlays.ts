@@ -50,14 +50,14 @@ export class Overlays {
     setLines(this.keyframes, keyframes.flatMap((keyframe) => frustum(keyframe, this.frustumDepth)));
   }
 
-  /** Whether the live cameras' poses are current; if not, they are drawn faintly. */
+  /** Sets whether the poses of the live cameras are current; if not, they are drawn faintly. */
   setLive(isLive: boolean): void {
     for (const drawn of this.live.values()) {
       (drawn.material as THREE.LineBasicMaterial).opacity = isLive ? 1 : 0.3;
     }
   }
 
-  /** Draws a camera where it is now; says whether that is elsewhere than before. */
+  /** Draws a camera at its current pose; returns whether the pose changed. */
   setLiveCamera(camera: PosedCamera): boolean {
     let drawn = this.live.get(camera.camera);
     const place = [...camera.world_from_camera, ...camera.focal_px, this.frustumDepth].join();

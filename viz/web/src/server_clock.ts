@@ -1,32 +1,32 @@
-// The server's clock as seen from here. It errs on the late side, so that no age is understated.
+// Estimates the server's clock. The estimate errs so that no age is understated.
 
-/** A sample is used for this long: clocks drift apart. */
+/** Samples are used for this long, because clocks drift apart. */
 const SAMPLE_LIFE_MILLIS = 30_000;
 
 export class ServerClock {
-  /** When a ping was sent, and by how much the server's clock was ahead of that when it answered. */
+  /** When each ping was sent, and by how much the server's clock was ahead of that time when the server answered. */
   private samples: { sentAt: number; ahead: number }[] = [];
 
-  /** Takes in the answer to a ping. The server read its clock after the ping was sent: it is at most that far ahead. */
+  /** Adds the answer to a ping. The server read its clock after the ping was sent, so it is ahead by at most this much. */
   answered(sentAt: number, clockMillis: number): void {
     const oldest = performance.now() - SAMPLE_LIFE_MILLIS;
     this.samples = this.samples.filter((sample) => sample.sentAt > oldest);
     this.samples.push({ sentAt, ahead: clockMillis - sentAt });
   }
 
-  /** Takes in the time of any message. The server read its clock before now: it is at least that far ahead. */
+  /** Checks samples against the time in any message. The server read its clock before now, so it is ahead by at least this much. */
   heard(clockMillis: number): void {
     const ahead = clockMillis - performance.now();
-    // Samples below were taken before one of the computers slept.
+    // Smaller samples were taken before one of the computers was suspended.
     this.samples = this.samples.filter((sample) => sample.ahead >= ahead);
   }
 
-  /** A new server has a new clock. */
+  /** Discards all samples: a new server has a new clock. */
   forget(): void {
     this.samples = [];
   }
 
-  /** How long ago something happened at most, milliseconds; null until the server has answered a ping. */
+  /** Upper bound on the age of an event, milliseconds; null until the server has answered a ping. */
   age(clockMillis: number): number | null {
     if (this.samples.length === 0) return null;
     const ahead = Math.min(...this.samples.map((sample) => sample.ahead));

@@ -132,7 +132,7 @@ impl NerfModel {
     pub(super) fn put_back(&mut self, saved: &Saved) -> Result<(), Error> {
         (self.step, self.learned) = (saved.step, saved.learned);
         self.n_hinted = saved.n_hinted.min(self.images.len());
-        self.is_extent_due |= self.n_hinted < self.images.len(); // Those are hinted at again.
+        self.is_extent_due |= self.n_hinted < self.images.len(); // Their hints are added again.
         self.fixes = None;
         let Some((_, learner)) = &mut self.field else { return Ok(()) };
         match saved.n_terms() {

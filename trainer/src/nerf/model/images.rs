@@ -36,7 +36,7 @@ const JUDGING_SEED: u64 = 0x6a75_6467;
 pub(super) struct Saved {
     pub(super) arrays: Vec<Array>,
     pub(super) step: u64,
-    /// Images that the field had hints of.
+    /// Number of images whose hints the field has.
     pub(super) n_hinted: usize,
     pub(super) learned: TermSet,
 }

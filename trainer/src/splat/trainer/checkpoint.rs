@@ -24,7 +24,7 @@ const ARRAYS: [&str; N_PLANED] =
 const SEED_PLACES: &str = "seed_places";
 const SEED_CELLS: &str = "seed_cells";
 const CAMERA_TERMS: &str = "camera_terms";
-/// Begins the names of the arrays of the other half of a trial under way.
+/// Prefix of the array names of the other half of a trial in progress.
 const OTHER: &str = "other_";
 
 /// All but the arrays.
@@ -57,19 +57,19 @@ struct State {
     /// Whether alignment is settled, and what it found; views are told as it corrected them.
     is_aligned: bool,
     alignment: Option<Alignment>,
-    /// A trial under way.
+    /// A trial in progress.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     trial: Option<TrialState>,
 }
 
-/// A trial under way: the half that learns is the state above, and the arrays of the other have names of their own.
+/// A trial in progress: the half in training is the state above, and the arrays of the other half have a prefix.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct TrialState {
     candidate: Candidate,
     until: u64,
     scored: Vec<Image>,
-    /// Of the first half, once that is over.
+    /// Scores of the first half, once it is over.
     scores_without: Option<Vec<(Image, f64)>>,
     arrivals: Vec<ArrivalState>,
     other: OtherHalf,
@@ -78,7 +78,7 @@ struct TrialState {
 /// Camera and stamp, nanoseconds.
 type Image = (String, i64);
 
-/// A keyframe that arrived in the first half of a trial. In the second half it is no view until it arrives again.
+/// A keyframe that arrived in the first half of a trial. In the second half it is not a view until it arrives again.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ArrivalState {
@@ -141,7 +141,7 @@ impl TrialState {
         }
     }
 
-    /// The trial, with the state of its other half and the keyframes of its arrivals.
+    /// The trial, with the state of its other half and the keyframes that arrived.
     fn restored(
         self,
         gpu: &Gpu,
@@ -181,7 +181,7 @@ impl TrialState {
     }
 }
 
-/// Splats of `[n_splats, capacity, sh_degree, active_degree]` out of the arrays whose names begin like this.
+/// Splats of size `[n_splats, capacity, sh_degree, active_degree]`, from the arrays with this prefix.
 fn read_splats(
     gpu: &Gpu,
     checkpoint: &Checkpoint,
@@ -214,7 +214,7 @@ fn read_seeds(checkpoint: &Checkpoint, prefix: &str, n_seeds: u64) -> Result<See
     Ok(Seeder::of_bytes(array(SEED_PLACES, Seeder::PLACE_BYTES)?, array(SEED_CELLS, Seeder::CELL_BYTES)?))
 }
 
-/// The arrays of one state of the model on their way to the host.
+/// The arrays of one state of the model while they are copied to the host.
 struct PendingArrays {
     prefix: &'static str,
     planes: Vec<Planes>,
@@ -320,7 +320,7 @@ impl SplatTrainer {
         } else {
             Aligning::new(&state.options.align)
         };
-        // In the second half of a trial some keyframes have yet to arrive again; in the first they are views.
+        // In the second half of a trial, some keyframes have yet to arrive again; in the first half, they are views.
         let arrivals = || state.trial.iter().flat_map(|trial| &trial.arrivals).map(|arrival| &arrival.image);
         let is_second_half = state.trial.as_ref().is_some_and(|trial| trial.scores_without.is_some());
         let yet_to_arrive = arrivals().filter(|_| is_second_half);

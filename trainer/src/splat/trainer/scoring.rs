@@ -44,10 +44,10 @@ fn log_gains(products: &[Products; 3]) -> [f64; 3] {
     })
 }
 
-/// Bytes of the sums of a workgroup of `score.wgsl`.
+/// Size of a workgroup's sums in `score.wgsl`, bytes.
 pub(super) const PRODUCTS_BYTES: usize = 48;
 
-/// Lists the comparison of a picture with an image; says how many workgroups write sums.
+/// Adds the comparison of a picture with an image to the list; returns how many workgroups write sums.
 pub(super) fn compare(
     gpu: &Gpu,
     passes: &mut Passes,
@@ -73,7 +73,7 @@ fn sum_up(sums: &[[u32; 4]]) -> [Products; 3] {
     })
 }
 
-/// PSNR, dB, computed as [`crate::eval::psnr`] does, with the same bits: sums of whole numbers have no rounding.
+/// PSNR in dB with the same bits as [`crate::eval::psnr`]: integer sums have no rounding.
 fn psnr_as_evaluated(products: &[Products; 3]) -> Result<f64, Error> {
     let n: u64 = products.iter().map(|color| color.n_seen).sum();
     if n == 0 {
@@ -86,7 +86,7 @@ fn psnr_as_evaluated(products: &[Products; 3]) -> Result<f64, Error> {
 }
 
 impl SplatTrainer {
-    /// PSNR of the picture that people see of a view against the image of a keyframe of its size; `None` before learning has
+    /// PSNR of the picture that viewers see of a view against a keyframe's image of the same size; `None` before training has
     /// begun.
     pub(super) fn psnr_of_view(
         &mut self,
@@ -170,7 +170,7 @@ impl SplatTrainer {
         before.into_iter().chain(after).map(|(ix, _)| ix).collect()
     }
 
-    /// Adds the gains of these views that are not known.
+    /// Adds the missing gains of these views.
     fn add_gains(
         &mut self,
         known: &mut BTreeMap<usize, [f64; 3]>,
@@ -187,7 +187,7 @@ impl SplatTrainer {
         Ok(())
     }
 
-    /// The gains that bring the picture of a view nearest to its image, which is on the GPU.
+    /// The gains that best match the picture of a view to its image, which is on the GPU.
     fn gains_of(&mut self, view_ix: usize, fixes: &Fixes) -> Result<[f64; 3], Error> {
         let keyframe = self.views[view_ix].keyframe.clone();
         self.draw_keyframe(&keyframe, fixes)?;
@@ -299,7 +299,7 @@ mod tests {
         let mut trainer = SplatTrainer::new(gpu, options()).unwrap();
         trainer.push(keyframes[1].clone()).unwrap();
         train(&mut trainer, 20);
-        // An image with a mask at the edge of a workgroup, and whole ones after it in the same buffer.
+        // A masked image at the edge of a workgroup, followed by complete images in the same buffer.
         let mut rgba = keyframes[0].rgba_srgb.to_vec();
         rgba.as_chunks_mut::<4>().0[250..900].iter_mut().for_each(|pixel| pixel[3] = 0);
         let masked = Keyframe { rgba_srgb: rgba.into(), ..keyframes[0].as_ref().clone() };
@@ -308,7 +308,7 @@ mod tests {
             let pair = PixelPair::new(keyframe.size_px, &picture.rgba_srgb, &keyframe.rgba_srgb).unwrap();
             assert_eq!(trainer.psnr(&asked(keyframe), keyframe).unwrap(), Some(psnr(&pair).unwrap()));
         }
-        // A picture equals itself.
+        // A picture compared with itself.
         let picture = trainer.render(&asked(&keyframes[0])).unwrap();
         let mut rgba = picture.rgba_srgb;
         rgba.as_chunks_mut::<4>().0.iter_mut().for_each(|pixel| pixel[3] = 255);
@@ -319,7 +319,7 @@ mod tests {
         let small = crate::RenderRequest { size_px: [8, 8], ..asked(&same) };
         assert_eq!(trainer.psnr(&small, &same).unwrap(), None, "another size");
         let mut loaded = SplatTrainer::from_arrays(trainer.gpu.clone(), options(), &trainer.arrays().unwrap()).unwrap();
-        assert_eq!(loaded.psnr(&asked(&same), &same).unwrap(), None, "what learning needs is not compiled");
+        assert_eq!(loaded.psnr(&asked(&same), &same).unwrap(), None, "the training pipelines are not compiled");
     }
 
     /// From the middle of the capture on the images are darker by a stop.
