@@ -8,8 +8,8 @@ CASE is one of
     head    the reader of stdout closes the pipe after one line
     full    stdout and stderr are /dev/full
     disk    the output folder is a tmpfs of 6 MB (needs root)
-    kill    only for train: SIGKILL at a random moment after the first checkpoint; the run is then resumed without flags and must end with
-            the hash of an uninterrupted one
+    kill    train or run: SIGKILL at a random moment after the first checkpoint; the run is then resumed without flags. Training must
+            end with the hash of an uninterrupted one, a live run must keep its keyframes
 
 A trial passes if its recording can be read and its model, or a checkpoint, can be loaded. FOLDER keeps the files of trials that fail.
 """
@@ -153,32 +153,51 @@ class Trial:
         return f"exit code {process.returncode}"
 
     def kill(self):
+        return self.kill_train() if self.args.command == "train" else self.kill_run()
+
+    def kill_after_checkpoint(self, process, max_wait_secs):
+        """Kills a run at a random moment after its first checkpoint; returns that moment, and whether it was still running."""
+        while not (self.out / "model/training.ckpt").exists():
+            expect(process.poll() is None, "it ended before its first checkpoint")
+            time.sleep(0.01)
+        wait_secs = self.random.uniform(0.0, max_wait_secs)
+        time.sleep(wait_secs)
+        process.send_signal(signal.SIGKILL)
+        return wait_secs, process.wait() == -signal.SIGKILL
+
+    def kill_train(self):
         steps = ["--steps", str(self.args.steps), "--method", self.args.method, "--checkpoint-secs", "1"]
         more = SMALL if self.args.method == "splat" else []
         command = [self.exe, "train", self.data, *steps, *more, "--json", "--out"]
-        whole, secs = self.data.parent / f"whole-{self.args.method}.json", self.data.parent / f"whole-{self.args.method}"
-        if not whole.exists():
+        uninterrupted = self.data.parent / f"whole-{self.args.method}"
+        about = uninterrupted.with_suffix(".json")
+        if not about.exists():
             begun = time.monotonic()
-            done = json.loads(self.fieldrig(*command[1:], secs).stdout.splitlines()[-1])
-            whole.write_text(json.dumps({"sha256": done["checkpoint_sha256"], "secs": time.monotonic() - begun}))
-        expected = json.loads(whole.read_text())
-        run = self.out / "model"
-        process = self.start([*command, run], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        while not (run / "training.ckpt").exists():
-            expect(process.poll() is None, "it ended before its first checkpoint")
-            time.sleep(0.01)
-        wait_secs = self.random.uniform(0.0, max(expected["secs"] - 3.0, 1.0))
-        time.sleep(wait_secs)
-        process.send_signal(signal.SIGKILL)
-        was_killed = process.wait() == -signal.SIGKILL
-        done = json.loads(self.fieldrig("train", self.data, "--resume", run, "--json").stdout.splitlines()[-1])
-        expect(done.get("checkpoint_sha256") == expected["sha256"], f"the hash differs: {done}")
-        return f"killed {wait_secs:.1f} s after the first checkpoint" if was_killed else "it had already ended"
+            done = json.loads(self.fieldrig(*command[1:], uninterrupted).stdout.splitlines()[-1])
+            about.write_text(json.dumps({"sha256": done["checkpoint_sha256"], "secs": time.monotonic() - begun}))
+        expected = json.loads(about.read_text())
+        process = self.start([*command, self.out / "model"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        wait_secs, was_killed = self.kill_after_checkpoint(process, max(expected["secs"] - 3.0, 1.0))
+        done = json.loads(self.fieldrig("train", self.data, "--resume", self.out / "model", "--json").stdout.splitlines()[-1])
+        expect(done.get("checkpoint_sha256") == expected["sha256"], f"another hash: {done}")
+        return f"killed {wait_secs:.1f} s after the first checkpoint" if was_killed else "it had ended"
+
+    def kill_run(self):
+        process = self.start(self.command(12), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        wait_secs, was_killed = self.kill_after_checkpoint(process, 8.0)
+        expect(was_killed, "it had ended")
+        n_kept = len(list((self.out / "model/keyframes").glob("*.keyframe")))
+        live = ["--listen", "127.0.0.1:0", "--when-done", "exit"]
+        self.fieldrig("run", self.rig, "--resume", self.out / "model", *live, codes=(0, 3))
+        with open(self.out / "model/keyframes.txt") as keyframes:
+            n_keyframes = sum(not line.startswith("#") for line in keyframes)
+        expect(n_keyframes >= n_kept, f"{n_kept} keyframes before, {n_keyframes} after")
+        return f"killed {wait_secs:.1f} s after the first checkpoint with {n_kept} keyframes, {n_keyframes} at the end"
 
     def run(self):
         try:
             told = getattr(self, self.args.case)()
-            if self.args.case != "kill":
+            if (self.args.case, self.args.command) != ("kill", "train"):
                 told += "; " + self.check()
         finally:
             if self.args.case == "disk":
@@ -200,7 +219,7 @@ def main():
     parser.add_argument("--method", default="splat", help="for kill")
     parser.add_argument("--steps", type=int, default=300, help="for kill")
     args = parser.parse_args()
-    if args.case == "kill" and args.command != "train":
+    if args.case == "kill" and args.command == "record":
         parser.error("the case kill requires the command train")
     data = Path(args.folder).resolve() / "data.mcap"
     data.parent.mkdir(parents=True, exist_ok=True)

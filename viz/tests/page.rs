@@ -25,6 +25,8 @@ const DESKTOP_PX: [u32; 2] = [1280, 800];
 const PHONE_PX: [u32; 2] = [390, 844];
 /// The page shows a lost connection within this time.
 const LOSS_SHOWN_WITHIN_MILLIS: f64 = 1000.0;
+/// How long the link is cut.
+const CUT: Duration = Duration::from_secs(25);
 /// Far more than two busy cores need to draw the page in software.
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Whether a pixel has a share of the page's `--accent`, the color of live cameras; nothing else here is blue-green.
@@ -320,10 +322,12 @@ fn the_page_shows_a_lost_server_and_the_end_of_a_run() {
 
     browser.evaluate("record.cutAt = performance.now()");
     proxy.cut();
+    let cut_at = Instant::now();
     std::thread::sleep(Duration::from_millis(1500));
     assert!(browser.text("banner").starts_with("No data from the server for "), "{}", browser.text("banner"));
     wait_for(&mut browser, "attempts to reconnect", |browser| browser.text("banner").contains("reconnecting"));
     shoot(&mut browser, "lost");
+    std::thread::sleep(CUT.saturating_sub(cut_at.elapsed()));
     camera.stop();
     std::thread::sleep(Duration::from_millis(600)); // From here on, every image is too old to be live.
     browser.evaluate("record.isLive = false");
