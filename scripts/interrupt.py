@@ -15,6 +15,7 @@ A trial passes if its recording can be read and its model, or a checkpoint, can 
 """
 
 import argparse
+import hashlib
 import json
 import os
 import pty
@@ -30,6 +31,8 @@ from pathlib import Path
 PATIENCE_SECS = 300
 # Limits with which a model trains within seconds even without a GPU.
 SMALL = ["--max-splats", "2000"]
+# The files of a saved model that its hash covers, in this order.
+MODEL_FILES = ["model.json", "splats.ply", "mesh.ply", "mesh.glb", "field.blocks", "field.nerf"]
 # What each command prints once it has its first keyframe or image.
 FIRST_WORDS = {"train": b"step", "run": b"step", "record": b"color images"}
 
@@ -155,12 +158,13 @@ class Trial:
     def kill(self):
         return self.kill_train() if self.args.command == "train" else self.kill_run()
 
-    def kill_after_checkpoint(self, process, max_wait_secs):
-        """Kills a run at a random moment after its first checkpoint; returns that moment, and whether it was still running."""
+    def kill_after_checkpoint(self, process, ends_after_secs):
+        """Kills a run at a random moment between its first checkpoint and its end; returns that moment, and whether it was running."""
+        begun = time.monotonic()
         while not (self.out / "model/training.ckpt").exists():
             expect(process.poll() is None, "it ended before its first checkpoint")
             time.sleep(0.01)
-        wait_secs = self.random.uniform(0.0, max_wait_secs)
+        wait_secs = self.random.uniform(0.0, max(begun + ends_after_secs - time.monotonic(), 0.2))
         time.sleep(wait_secs)
         process.send_signal(signal.SIGKILL)
         return wait_secs, process.wait() == -signal.SIGKILL
@@ -177,14 +181,24 @@ class Trial:
             about.write_text(json.dumps({"sha256": done["checkpoint_sha256"], "secs": time.monotonic() - begun}))
         expected = json.loads(about.read_text())
         process = self.start([*command, self.out / "model"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        wait_secs, was_killed = self.kill_after_checkpoint(process, max(expected["secs"] - 3.0, 1.0))
+        wait_secs, was_killed = self.kill_after_checkpoint(process, expected["secs"])
         done = json.loads(self.fieldrig("train", self.data, "--resume", self.out / "model", "--json").stdout.splitlines()[-1])
-        expect(done.get("checkpoint_sha256") == expected["sha256"], f"another hash: {done}")
-        return f"killed {wait_secs:.1f} s after the first checkpoint" if was_killed else "it had ended"
+        if done["event"] == "finished":  # Killed after its model was saved.
+            done, was_killed = {"checkpoint_sha256": self.sha256_of_model()}, False
+        expect(done["checkpoint_sha256"] == expected["sha256"], f"another hash: {done}")
+        return f"killed {wait_secs:.1f} s after the first checkpoint" if was_killed else "killed after its end"
+
+    def sha256_of_model(self):
+        """As in report.json, which a run that is killed while it scores its model does not write."""
+        sha256 = hashlib.sha256()
+        for file in [self.out / "model" / name for name in MODEL_FILES]:
+            if file.exists():
+                sha256.update(f"{file.name} {file.stat().st_size}\n".encode() + file.read_bytes())
+        return sha256.hexdigest()
 
     def kill_run(self):
         process = self.start(self.command(12), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        wait_secs, was_killed = self.kill_after_checkpoint(process, 8.0)
+        wait_secs, was_killed = self.kill_after_checkpoint(process, 12.0)
         expect(was_killed, "it had ended")
         n_kept = len(list((self.out / "model/keyframes").glob("*.keyframe")))
         live = ["--listen", "127.0.0.1:0", "--when-done", "exit"]
