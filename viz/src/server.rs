@@ -161,9 +161,11 @@ fn tune(listener: &TcpListener) {
 
 /// Accepts connections and serves each in a task of its own; never returns.
 async fn accept(listener: &tokio::net::TcpListener, admission: &Arc<Admission>, app: &TowerToHyperService<Router>) {
+    let mut is_failing = false;
     loop {
         match listener.accept().await {
             Ok((stream, _)) => {
+                is_failing = false;
                 // Small messages must not wait until large ones are acknowledged; if this fails, only latency suffers.
                 if let Err(error) = stream.set_nodelay(true) {
                     log::debug!("cannot disable Nagle's algorithm: {error}");
@@ -179,7 +181,10 @@ async fn accept(listener: &tokio::net::TcpListener, admission: &Arc<Admission>, 
             Err(error) if matches!(error.kind(), ErrorKind::ConnectionAborted | ErrorKind::ConnectionReset) => {}
             Err(error) => {
                 // Most likely all file descriptors are in use: free one, and pause to avoid a busy loop.
-                log::warn!("cannot accept a connection: {error}");
+                if !is_failing {
+                    log::warn!("cannot accept a connection: {error}");
+                }
+                is_failing = true;
                 admission.evict();
                 tokio::time::sleep(ACCEPT_PAUSE).await;
             }
