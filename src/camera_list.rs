@@ -1,6 +1,6 @@
 //! The cameras of a run's keyframes, in `cameras.json` beside the model, for viewers to start from and to draw.
 
-use crate::camera_path;
+use crate::{camera_path, run_folder};
 use anyhow::Context;
 use kinematics::Transform;
 use serde::{Deserialize, Serialize};
@@ -31,9 +31,7 @@ struct File {
 /// Writes the list, one camera per line.
 pub(crate) fn write(folder: &Path, cameras: &[PosedCamera]) -> anyhow::Result<()> {
     let lines: Vec<String> = cameras.iter().map(serde_json::to_string).collect::<Result<_, _>>()?;
-    let path = folder.join(FILE);
-    let text = format!("{{\"cameras\": [\n{}\n]}}\n", lines.join(",\n"));
-    std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))
+    run_folder::write_whole(&folder.join(FILE), &format!("{{\"cameras\": [\n{}\n]}}\n", lines.join(",\n")))
 }
 
 /// Reads the list; `None` if the folder has none.

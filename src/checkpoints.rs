@@ -1,5 +1,6 @@
 //! Checkpoints of a model in training: taken every so often, written on a thread of their own.
 
+use crate::exit::BadArgument;
 use crate::kept_keyframes::KeptKeyframes;
 use crate::run_folder::{CHECKPOINT, expect_one_model};
 use anyhow::Context;
@@ -48,6 +49,17 @@ fn secs(text: &str) -> Result<Duration, String> {
 pub(crate) fn read(folder: &Path) -> anyhow::Result<Checkpoint> {
     expect_one_model(folder)?;
     Checkpoint::read(&folder.join(CHECKPOINT)).with_context(|| format!("nothing to go on from in {}", folder.display()))
+}
+
+/// Refuses a limit in seconds that has already passed when training continues.
+pub(crate) fn refuse_over(seconds: Option<f64>, checkpoint: &Checkpoint, whose: &str) -> Result<(), BadArgument> {
+    match seconds.filter(|seconds| *seconds <= checkpoint.seconds) {
+        Some(seconds) => Err(BadArgument(format!(
+            "--seconds {seconds}: {whose} has been trained for {:.1} s, which count too; name more than that",
+            checkpoint.seconds
+        ))),
+        None => Ok(()),
+    }
 }
 
 /// What every checkpoint of a run holds besides the state of its model.
@@ -182,7 +194,10 @@ impl Checkpoints {
         let is_checkpoint = self.writing.as_ref().is_some_and(|writing| writing.is_checkpoint);
         match self.wait() {
             Ok(()) => {}
-            Err(error) if is_checkpoint => log::warn!("cannot write a checkpoint, the previous one stays: {error:#}"),
+            Err(error) if is_checkpoint => {
+                let previous = if self.path.exists() { ", the previous one stays" } else { "" };
+                log::warn!("cannot write a checkpoint{previous}: {error:#}");
+            }
             // The next checkpoint stores them too, and warns if that fails.
             Err(error) => log::debug!("cannot store keyframes: {error:#}"),
         }

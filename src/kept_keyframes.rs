@@ -3,10 +3,7 @@
 //! Each keyframe is a separate file in the layout of a checkpoint (`docs/saving.md`), with its color and depth as PNG.
 //! Ground truth from a simulator is left out.
 
-use crate::exit::BadArgument;
 use crate::join::{split_name, split_named};
-use crate::method::Kind;
-use crate::run_folder::CHECKPOINT;
 use anyhow::{Context, ensure};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
@@ -65,19 +62,6 @@ struct BaseDescription {
     stand: Option<usize>,
     world_from_base: [f64; 7],
     world_from_told: [f64; 7],
-}
-
-/// Refuses the folder of a live run that was cut off: another run would replace its keyframes and its checkpoint.
-pub(crate) fn refuse_unfinished(out: &Path) -> Result<(), BadArgument> {
-    let folders = std::iter::once(out.to_owned()).chain(Kind::ALL.into_iter().map(|kind| out.join(kind.name())));
-    match folders.into_iter().find(|folder| folder.join(FOLDER).exists() && folder.join(CHECKPOINT).exists()) {
-        Some(folder) => Err(BadArgument(format!(
-            "--out {}: {} holds a run that was cut off: --resume continues it, --out names another folder",
-            out.display(),
-            folder.display()
-        ))),
-        None => Ok(()),
-    }
 }
 
 impl KeptKeyframes {
@@ -303,18 +287,6 @@ mod tests {
         }
         kept.keep_only(&all[1..]).expect("they are there");
         assert_eq!(kept.read().expect("whole").len(), 2);
-    }
-
-    #[test]
-    fn a_run_that_was_cut_off_is_not_overwritten() {
-        let out = tempfile::tempdir().expect("a folder");
-        let run = out.path().join(Kind::Splat.name());
-        std::fs::create_dir(&run).expect("room");
-        KeptKeyframes::of_run(&run).add(&[keyframe(1, false)]).expect("room");
-        refuse_unfinished(out.path()).expect("without a checkpoint there is nothing to continue from");
-        std::fs::write(run.join(CHECKPOINT), b"x").expect("room");
-        assert!(refuse_unfinished(out.path()).is_err_and(|error| error.0.contains("splat holds a run")));
-        assert!(refuse_unfinished(&run).is_err());
     }
 
     #[test]

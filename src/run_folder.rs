@@ -8,6 +8,7 @@ use crate::splat_file;
 use anyhow::{Context, bail, ensure};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -36,6 +37,19 @@ pub(crate) fn refuse_model(folder: &Path) -> Result<(), BadArgument> {
             "--out {}: the folder holds a model already ({}), name another one",
             folder.display(),
             file.display()
+        ))),
+        None => Ok(()),
+    }
+}
+
+/// Refuses the folder of a run that was cut off, or of several: another run would replace the checkpoint.
+pub(crate) fn refuse_unfinished(out: &Path) -> Result<(), BadArgument> {
+    let folders = std::iter::once(out.to_owned()).chain(Kind::ALL.into_iter().map(|kind| out.join(kind.name())));
+    match folders.into_iter().find(|folder| folder.join(CHECKPOINT).exists()) {
+        Some(folder) => Err(BadArgument(format!(
+            "--out {}: {} holds a run that was cut off: --resume continues it, --out names another folder",
+            out.display(),
+            folder.display()
         ))),
         None => Ok(()),
     }
@@ -270,13 +284,17 @@ pub(crate) fn save_model(method: &mut dyn Method, folder: &Path) -> anyhow::Resu
 pub(crate) fn write_json(path: &Path, report: &impl Serialize) -> anyhow::Result<()> {
     let mut text = serde_json::to_string_pretty(report).context("cannot write the report as JSON")?;
     text.push('\n');
-    std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
+    write_whole(path, &text)
+}
+
+/// Writes a file that is either complete or absent.
+pub(crate) fn write_whole(path: &Path, text: &str) -> anyhow::Result<()> {
+    Ok(trainer::whole_file::write(path, |file| file.write_all(text.as_bytes()))?)
 }
 
 /// Writes which keyframes were used, and what for, for `--keyframes`.
 pub(crate) fn write_keyframe_list(path: &Path, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
-    std::fs::write(path, crate::join::keyframe_list(keyframes.iter()))
-        .with_context(|| format!("cannot write {}", path.display()))
+    write_whole(path, &crate::join::keyframe_list(keyframes.iter()))
 }
 
 /// SHA-256 over the model files of a folder, each preceded by its name and length.
@@ -369,6 +387,18 @@ mod tests {
         expect_one_model(&made[1]).expect("one");
         let told = refuse_model(&asked).expect_err("one inside").0;
         assert!(told.contains("splat/splats.ply"), "{told}");
+    }
+
+    #[test]
+    fn a_run_that_was_cut_off_is_not_overwritten() {
+        let out = tempfile::tempdir().expect("a folder");
+        refuse_unfinished(&out.path().join("new")).expect("nothing is there");
+        let run = out.path().join(Kind::Splat.name());
+        std::fs::create_dir(&run).expect("room");
+        refuse_unfinished(out.path()).expect("without a checkpoint there is nothing to continue from");
+        std::fs::write(run.join(CHECKPOINT), b"x").expect("room");
+        assert!(refuse_unfinished(out.path()).is_err_and(|error| error.0.contains("splat holds a run")));
+        assert!(refuse_unfinished(&run).is_err());
     }
 
     #[test]

@@ -14,6 +14,7 @@ use crate::recovery::{self, Recovery};
 use crate::stop::Stop;
 use crate::turns::TURN;
 use crate::{camera_list, checkpoints, exit, print, report, run_folder};
+use anyhow::Context;
 use indicatif::ProgressBar;
 use serde::Serialize;
 use std::collections::{BTreeMap, VecDeque};
@@ -230,21 +231,30 @@ pub(crate) fn finish(mut endings: Vec<Ending<impl Serialize>>) -> anyhow::Result
     // Saved before any is scored: a second Ctrl-C during the scoring loses nothing.
     let ended_secs: Vec<f64> = endings.iter_mut().map(|ending| ending.session.halt()).collect::<anyhow::Result<_>>()?;
     let mut saved = Vec::new();
+    // The first error ends the command, the others are logged.
     let mut failed = Ok(());
+    let mut note = |error: anyhow::Error| match failed {
+        Ok(()) => failed = Err(error),
+        Err(_) => log::error!("{error:#}"),
+    };
     for (mut ending, seconds) in endings.into_iter().zip(ended_secs) {
         // If one model cannot be saved, the others still are.
         match ending.session.save(&ending.out, seconds) {
             Ok(Saved { folder, sha256, failed: error }) => {
                 ending.out = folder;
                 ending.session.write_cameras(&ending.out);
-                failed = failed.and(error.map_or(Ok(()), Err));
+                error.into_iter().for_each(&mut note);
                 saved.push((ending, seconds, sha256));
             }
-            Err(error) => failed = failed.and(Err(error)),
+            Err(error) => note(error),
         }
     }
     for (ending, ..) in &mut saved {
-        failed = failed.and(ending.session.checkpoints.as_mut().map_or(Ok(()), Checkpoints::wait));
+        if let Some(Err(error)) = ending.session.checkpoints.as_mut().map(Checkpoints::wait) {
+            note(
+                error.context(format!("the model was saved in {}, but not its last checkpoint", ending.out.display())),
+            );
+        }
     }
     if saved.iter().any(|(ending, ..)| ending.session.stop.asked()) {
         log::info!("saved; scoring the test images, Ctrl-C again leaves that out");
@@ -253,7 +263,7 @@ pub(crate) fn finish(mut endings: Vec<Ending<impl Serialize>>) -> anyhow::Result
     for (Ending { session, out, particulars }, seconds, sha256) in saved {
         match session.tell_end(&out, seconds, &sha256, &particulars) {
             Ok(model) => finished.push(model),
-            Err(error) => failed = failed.and(Err(error)),
+            Err(error) => note(error),
         }
     }
     if finished.iter().any(|model| model.tell == Tell::Lines) {
@@ -499,6 +509,13 @@ impl Session {
         self.recovery.as_ref()
     }
 
+    /// Waits until no checkpoint is being written.
+    pub(crate) fn wait_for_checkpoint(&mut self) {
+        if let Some(Err(error)) = self.checkpoints.as_mut().map(Checkpoints::wait) {
+            log::debug!("the last checkpoint was not written: {error:#}");
+        }
+    }
+
     /// Whether this run has written a checkpoint.
     pub(crate) fn has_checkpoint(&mut self) -> bool {
         self.checkpoints.as_mut().is_some_and(|checkpoints| checkpoints.newest().is_some())
@@ -709,7 +726,8 @@ impl Session {
         {
             log::warn!("{error:#}");
         }
-        if self.method.progress().primitives == 0 {
+        let progress = self.method.progress();
+        if progress.step > 0 && progress.primitives == 0 {
             log::warn!("the model is empty: nothing that was seen could be used");
         }
         // Saving ends a trial in progress. The checkpoint holds the state before that, so that a resumed run ends the trial when it is due.
@@ -827,7 +845,7 @@ impl Session {
             }
             Tell::Bar | Tell::Nothing => {}
         }
-        written?;
+        written.with_context(|| format!("the model was saved in {}, but its report was not", out.display()))?;
         Ok(self.finished(out, (seconds, done.scores), outcome.per_image.len()))
     }
 

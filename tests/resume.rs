@@ -236,5 +236,5 @@ fn a_live_run_that_is_killed_continues_with_its_keyframes_and_its_clock() {
     };
     refused(&["--resume", "out", "--seed", "5"], "--seed");
     std::fs::remove_dir_all(folder.join("out/keyframes")).unwrap();
-    refused(&["--resume", "out", "--seconds", "30", "--out", "x"], "has no keyframes to continue with");
+    refused(&["--resume", "out", "--seconds", "30", "--out", "x"], "has no keyframes that can be used");
 }

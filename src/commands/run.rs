@@ -8,7 +8,7 @@ use crate::evaluate::Evaluator;
 use crate::exit::{self, BadArgument, Exit, LackOfEvidence};
 use crate::feed::{Feed, Input};
 use crate::join::{Counts, Join, Refusal, Use};
-use crate::kept_keyframes::{self, KeptKeyframes};
+use crate::kept_keyframes::KeptKeyframes;
 use crate::live::{Live, LiveOptions, Pace};
 use crate::method::{self, Kind, Recipe, Resumed};
 use crate::next_commands::{DataSource, quoted};
@@ -54,8 +54,8 @@ pub(crate) struct Args {
     /// Write everything that comes in to an MCAP file; what devices lose then is a loss (exit code 3), else the next image does
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
-    /// Continue a run that crashed or was stopped, from the checkpoint and keyframes in its folder and with its flags; no other flag
-    /// is needed. New keyframes are added
+    /// Continue a run that crashed or was stopped, from the checkpoint and keyframes in its folder and with its flags. New
+    /// keyframes are added; --record and --listen are given anew
     #[arg(long, value_name = "FOLDER", conflicts_with_all = ["from", "method", "seed", "max_bytes", "max_splats", "refine", "count"])]
     resume: Option<PathBuf>,
     /// Stop S seconds after the first image, including the time before --resume [default: run until Ctrl-C]
@@ -151,6 +151,10 @@ fn drive(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
     {
         return args.report_finished(earlier);
     }
+    if let Some(earlier) = &earlier {
+        let whose = format!("the checkpoint in {}", earlier.folder.display());
+        checkpoints::refuse_over(args.seconds, &earlier.checkpoint, &whose)?;
+    }
     let args = &earlier.as_ref().map_or_else(|| args.clone(), |earlier| args.with_flags_of(earlier));
     let mut running = start(args, earlier.as_ref(), made)?;
     let ended = loop {
@@ -238,7 +242,10 @@ impl Running {
     /// Closes the devices without saving anything; returns why they ended too early, if they did.
     pub(super) fn discard(self) -> anyhow::Result<Option<drivers::Error>> {
         self.stop.ask();
-        Ok(self.live.finish().1?.input_error)
+        let (mut sessions, leftover) = self.live.finish();
+        // Checkpoints in progress are written into folders that the caller may remove.
+        sessions.iter_mut().for_each(Session::wait_for_checkpoint);
+        Ok(leftover?.input_error)
     }
 }
 
@@ -247,7 +254,7 @@ pub(super) fn start(args: &Args, earlier: Option<&Earlier>, made: &mut MadeFolde
     if let Some(out) = &args.out {
         run_folder::refuse_model(out)?;
         if args.resume.as_ref() != Some(out) {
-            kept_keyframes::refuse_unfinished(out)?;
+            run_folder::refuse_unfinished(out)?;
         }
     }
     let stop = Stop::on_ctrl_c()?;
@@ -456,7 +463,10 @@ impl Earlier {
         let checkpoint = checkpoints::read(folder)?;
         let kept = KeptKeyframes::of_run(folder).read();
         let keyframes = kept.with_context(|| {
-            format!("the run in {} has no keyframes to continue with; `train` continues from data", folder.display())
+            format!(
+                "the run in {} has no keyframes that can be used; `train` continues from a recording",
+                folder.display()
+            )
         })?;
         log::info!(
             "continuing the run in {} after {:.1} s, with {}",

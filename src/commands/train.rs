@@ -48,7 +48,7 @@ pub(crate) struct Args {
     #[command(flatten)]
     training: TrainingArgs,
     /// Continue from the checkpoint that an earlier run left in this folder, on the same data and with its flags; no other flag is
-    /// needed. A flag given here replaces the earlier one, for example a larger --steps or --seconds
+    /// needed. A larger --steps or --seconds continues a finished run; settings of the model stay as they were
     #[arg(long, value_name = "FOLDER", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "count", "plan_steps"])]
     resume: Option<PathBuf>,
     /// Repeat what the clock decided in an earlier run, and get the same model: with the settings of the log that it left
@@ -123,6 +123,9 @@ fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
     if let Some(out) = &args.out {
         run_folder::refuse_model(out)?;
         run_folder::refuse_data(out, &args.data)?;
+        if args.resume.as_ref() != Some(out) {
+            run_folder::refuse_unfinished(out)?;
+        }
     }
     let stop = Stop::on_ctrl_c()?;
     let checkpoint = args.resume.as_deref().map(checkpoints::read).transpose()?;
@@ -135,8 +138,9 @@ fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
             }
             return args.report_finished(checkpoint);
         }
-        refuse_over(args.seconds, checkpoint, whose)?;
+        checkpoints::refuse_over(args.seconds, checkpoint, whose)?;
     }
+    let given_steps = args.steps;
     let args = &checkpoint.as_ref().map_or_else(|| args.clone(), |checkpoint| args.with_flags_of(checkpoint));
     let limits = match (&replay, &checkpoint) {
         (Some(_), _) => Limits::default(),
@@ -187,6 +191,11 @@ fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
     }
     let mut models = args.models(&gpu, &data, replay.as_ref(), checkpoint.as_ref())?;
     let from_step = checkpoint.is_some().then(|| models[0].method.n_taken()).transpose()?;
+    if let (Some(steps), Some(from_step), Some(whose)) = (given_steps, from_step, &whose)
+        && steps < from_step
+    {
+        return Err(BadArgument(format!("--steps {steps}: {whose} is of step {from_step}, name at least that")).into());
+    }
     if let Some(replay) = &replay {
         replay.check_start(from_step)?;
         replay.check_adapter(&gpu.describe());
@@ -278,17 +287,6 @@ fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
         write_rig(&Data::rig_as_given(&args.data, &images)?, alignment.as_ref(), file)?;
     }
     Ok(exit::after(&data.losses))
-}
-
-/// Refuses a limit in seconds that has already passed when training continues.
-fn refuse_over(seconds: Option<f64>, checkpoint: &Checkpoint, whose: &str) -> Result<(), BadArgument> {
-    match seconds.filter(|seconds| *seconds <= checkpoint.seconds) {
-        Some(seconds) => Err(BadArgument(format!(
-            "--seconds {seconds}: {whose} has been trained for {:.1} s, which count too; name more than that",
-            checkpoint.seconds
-        ))),
-        None => Ok(()),
-    }
 }
 
 /// Writes the rig file, and says where nothing changed in it.

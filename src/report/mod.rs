@@ -11,7 +11,7 @@ use crate::chart::drawing::escaped;
 use crate::chart::{Axis, Chart, Line, Point, Scale};
 use crate::marks;
 use crate::next_commands::NextCommand;
-use anyhow::Context;
+use crate::run_folder;
 use serde_json::{Map, Value};
 use std::fmt::Write;
 use std::path::Path;
@@ -39,8 +39,7 @@ pub(crate) struct Page<'a> {
 impl Page<'_> {
     /// Writes the page into the folder.
     pub(crate) fn write(&self) -> anyhow::Result<()> {
-        let path = self.folder.join(FILE);
-        std::fs::write(&path, self.html()).with_context(|| format!("cannot write {}", path.display()))
+        run_folder::write_whole(&self.folder.join(FILE), &self.html())
     }
 
     fn html(&self) -> String {

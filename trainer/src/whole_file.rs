@@ -14,7 +14,7 @@ pub fn partial_path(path: &Path) -> PathBuf {
 
 /// Writes a file under a temporary name, syncs it, and renames it: whatever happens, the name refers to the complete previous
 /// file or the complete new one. A partial file is removed after an error.
-pub(crate) fn write(path: &Path, contents: impl FnOnce(&mut File) -> std::io::Result<()>) -> Result<(), Error> {
+pub fn write(path: &Path, contents: impl FnOnce(&mut File) -> std::io::Result<()>) -> Result<(), Error> {
     let partial = partial_path(path);
     let written = File::create(&partial).and_then(|mut file| {
         contents(&mut file)?;

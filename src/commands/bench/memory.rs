@@ -73,8 +73,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     // Checkpoints are part of a run: they are written, and then removed with their folder.
     let run_folder = args.out.join(format!("run-{}", std::process::id()));
     let measured = args.run_flags(&run_folder).and_then(|flags| measure(args, &flags));
-    if run_folder.exists() {
-        std::fs::remove_dir_all(&run_folder).with_context(|| format!("cannot remove {}", run_folder.display()))?;
+    if run_folder.exists()
+        && let Err(error) = std::fs::remove_dir_all(&run_folder)
+    {
+        log::warn!("cannot remove {}: {error}", run_folder.display());
     }
     let mut measured = measured?;
     let findings = findings(args, &measured)?;
