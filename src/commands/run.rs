@@ -411,6 +411,8 @@ fn save(
     log::info!("{counts}");
     let mut losses =
         counts.losses(if args.record.is_some() && args.from.is_none() { Use::Recorded } else { Use::Watched });
+    // Keyframes that the recording does not hold cannot be scored on it again.
+    let is_recorded = leftover.recording_error.is_none();
     losses.extend(leftover.recording_error.map(|error| format!("the recording is cut off: {error:#}")));
     losses.extend(damage.get().cloned());
     let stands = leftover.stands.as_ref().map_or(Vec::new(), |stands| stands.reports().to_vec());
@@ -428,7 +430,7 @@ fn save(
             stands: stands.clone(),
             worst_position_error_m: live_error_m,
         },
-        session,
+        session: if is_recorded { session } else { session.with_data(DataSource::default()) },
         out,
     };
     let mut models = Vec::new();
