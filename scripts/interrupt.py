@@ -175,7 +175,8 @@ class Trial:
 
     def kill_train(self):
         steps = ["--steps", str(self.args.steps), "--method", self.args.method, "--checkpoint-secs", "1"]
-        more = ["--scale", "0.25", *(SMALL if self.args.method == "splat" else [])]
+        # Few and small test images: scoring them takes most of the time without a GPU.
+        more = ["--scale", "0.25", "--holdout", "30", *(SMALL if self.args.method == "splat" else [])]
         command = [self.exe, "train", self.data, *steps, *more, "--json", "--out"]
         uninterrupted = self.data.parent / f"whole-{self.args.method}"
         about = uninterrupted.with_suffix(".json")
