@@ -1,6 +1,6 @@
 //! The log of what a clock decided: which keyframes came and went at which step, and when training ended.
 //!
-//! One JSON object a line, see `docs/saving.md`. There is no time in it: with the same data it gives the same model again.
+//! One JSON object a line, see `docs/reference/files.md`. There is no time in it: with the same data it gives the same model again.
 
 use crate::exit::BadArgument;
 use crate::fingerprint;

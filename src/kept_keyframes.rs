@@ -1,6 +1,6 @@
 //! Stores the keyframes of a live run on disk, next to its checkpoint, for `run --resume`.
 //!
-//! Each keyframe is a separate file in the layout of a checkpoint (`docs/saving.md`), with its color and depth as PNG.
+//! Each keyframe is a separate file in the layout of a checkpoint (`docs/reference/files.md`), with its color and depth as PNG.
 //! Ground truth from a simulator is left out.
 
 use crate::join::{split_name, split_named};

@@ -448,7 +448,7 @@ fn motion(rig: &Rig) -> Option<Finding> {
     Some(match open::check_motion(rig) {
         Ok(()) => Finding::ok("motion", "[arm.motion] asks for what this kind of arm can do"),
         Err(error) => {
-            Finding::fail("motion", format!("{error:#}"), "docs/hardware.md tells what belongs into [arm.motion]")
+            Finding::fail("motion", format!("{error:#}"), "docs/guide/devices.md tells what belongs into [arm.motion]")
         }
     })
 }

@@ -1,6 +1,6 @@
 //! The rig file: TOML -> checked types, and back to the settled file that repeats a run.
 //!
-//! Every key is in `docs/rig.md`. Unknown keys are refused, flags override keys of the same name.
+//! Every key is in `docs/reference/rig.md`. Unknown keys are refused, flags override keys of the same name.
 
 mod can;
 mod error;
@@ -342,7 +342,7 @@ pub(crate) struct Override {
 }
 
 impl Override {
-    /// `key` is dotted, as in `docs/rig.md`.
+    /// `key` is dotted, as in `docs/reference/rig.md`.
     pub(crate) fn new(key: &'static str, value: impl Into<toml::Value>) -> Self {
         Self { key, value: value.into() }
     }

@@ -282,7 +282,7 @@ fn the_settled_file_gives_the_same_rig() {
 
 #[test]
 fn the_documentation_lists_exactly_the_keys_there_are() {
-    let page = include_str!("../../docs/rig.md");
+    let page = include_str!("../../docs/reference/rig.md");
     let documented: BTreeMap<String, &str> =
         page.lines().filter_map(|line| Some((line.strip_prefix("| `")?.split_once('`')?.0.to_owned(), line))).collect();
     let (_, _, reading) = read::keys("rig.toml", &full(), &[]).expect("TOML");
@@ -316,7 +316,7 @@ fn full() -> String {
 
 #[test]
 fn the_defaults_of_the_documentation_are_the_defaults() {
-    let page = include_str!("../../docs/rig.md");
+    let page = include_str!("../../docs/reference/rig.md");
     let rig = parse(RIG, &[]).expect("a good rig file");
     let settled: toml::Table = toml::from_str(&rig.to_toml()).expect("TOML");
     let mut n_checked = 0;

@@ -1,6 +1,6 @@
 //! The state of training on disk: a file that is whole or not there, and says what it is.
 //!
-//! `docs/saving.md` describes the layout.
+//! `docs/reference/files.md` describes the layout.
 
 use crate::{Error, whole_file};
 use serde::{Deserialize, Serialize};

@@ -1,4 +1,4 @@
-//! The messages of `docs/protocol.md` as they are written on the wire.
+//! The messages of `docs/reference/protocol.md` as they are written on the wire.
 
 use crate::clock::ServerClock;
 use crate::news::{KeyframePose, LiveImage, SceneHint, Status};

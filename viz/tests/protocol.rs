@@ -1,4 +1,4 @@
-//! Drives the real server over loopback as a stranger's program would, by `docs/protocol.md`.
+//! Drives the real server over loopback as a stranger's program would, by `docs/reference/protocol.md`.
 
 mod analytic_scene;
 mod client;
@@ -315,7 +315,7 @@ fn live_images_reach_every_client_once_as_jpeg() {
 #[test]
 fn every_field_on_the_wire_is_in_the_docs_and_known_to_the_page() {
     let folder = std::path::PathBuf::from(env!("CARGO_MANIFEST_DIR"));
-    let docs = std::fs::read_to_string(folder.join("../docs/protocol.md")).expect("the docs");
+    let docs = std::fs::read_to_string(folder.join("../docs/reference/protocol.md")).expect("the docs");
     let page = std::fs::read_to_string(folder.join("web/src/protocol.ts")).expect("the page's messages");
     assert!(docs.contains(&format!("Version **{}**", viz::PROTOCOL_VERSION)));
     assert!(page.contains(&format!("PROTOCOL_VERSION = {};", viz::PROTOCOL_VERSION)));
@@ -323,7 +323,7 @@ fn every_field_on_the_wire_is_in_the_docs_and_known_to_the_page() {
         let kind = message["type"].as_str().expect("a type");
         let section = section_of(&docs, kind);
         for name in message.as_object().expect("an object").keys().filter(|name| *name != "type") {
-            assert!(section.contains(&format!("`{name}`")), "{kind}.{name} is not in docs/protocol.md");
+            assert!(section.contains(&format!("`{name}`")), "{kind}.{name} is not in docs/reference/protocol.md");
             assert!(page.contains(&format!("{name}:")), "{kind}.{name} is not in web/src/protocol.ts");
         }
     }
@@ -364,7 +364,7 @@ fn one_of_each() -> Vec<Value> {
 fn section_of<'a>(docs: &'a str, kind: &str) -> &'a str {
     let from_server = &docs[docs.find("## From the server").expect("the chapter")..];
     let section = from_server.split("\n### ").find(|section| section.starts_with(&format!("`{kind}`")));
-    section.unwrap_or_else(|| panic!("docs/protocol.md has no section about {kind}"))
+    section.unwrap_or_else(|| panic!("docs/reference/protocol.md has no section about {kind}"))
 }
 
 #[test]

@@ -14,7 +14,7 @@ const MAX_ANSWER: Duration = Duration::from_secs(2);
 const LOOK: Duration = Duration::from_millis(1);
 /// What is said where a controller does not let us in.
 const WAY_BESIDE: &str = "FCI takes one client at a time: end the other one, or let it send the joint states and set \
-                          arm.driver = \"udp\" (docs/udp.md)";
+                          arm.driver = \"udp\" (docs/reference/udp.md)";
 
 /// An open connection; dropping it ends it.
 #[derive(Debug)]

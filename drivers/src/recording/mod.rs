@@ -1,6 +1,6 @@
 //! Recordings: samples to an MCAP file and back, bit for bit and in the same order.
 //!
-//! Which topic holds what, and why nothing is lost, is told in `docs/recording.md`.
+//! Which topic holds what, and why nothing is lost, is told in `docs/reference/recording.md`.
 
 mod reader;
 mod record;

@@ -1,4 +1,4 @@
-//! What arms, range scanners and bases send over UDP: one JSON object a datagram, every field in `docs/udp.md`.
+//! What arms, range scanners and bases send over UDP: one JSON object a datagram, every field in `docs/reference/udp.md`.
 
 use super::Malformed;
 use crate::RangePoint;
@@ -443,7 +443,7 @@ mod tests {
 
     #[test]
     fn the_datagrams_of_the_documentation_are_read() {
-        let page = include_str!("../../../docs/udp.md");
+        let page = include_str!("../../../docs/reference/udp.md");
         let examples: Vec<&str> = page.lines().filter(|line| line.starts_with(r#"{"kind""#)).collect();
         let scans: Vec<ScanPart> = examples.iter().filter_map(|text| decode_scan(text.as_bytes()).ok()).collect();
         let poses = examples.iter().filter(|text| decode_pose(text.as_bytes()).is_ok()).count();

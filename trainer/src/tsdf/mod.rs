@@ -1,6 +1,6 @@
 //! Scenes as truncated signed distance fields with color: the mesh baseline, from keyframes with depth.
 //!
-//! `docs/tsdf.md` follows a depth image through the kernels.
+//! `docs/design/tsdf.md` follows a depth image through the kernels.
 
 pub mod block;
 mod buffers;

@@ -1,4 +1,4 @@
-// The messages of docs/protocol.md, version 2.
+// The messages of docs/reference/protocol.md, version 2.
 
 /** Version this page was written for. */
 export const PROTOCOL_VERSION = 2;
