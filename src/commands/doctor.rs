@@ -447,9 +447,11 @@ fn motion(rig: &Rig) -> Option<Finding> {
     rig.arm.motion.as_ref().filter(|_| matches!(rig.arm.driver, ArmDriver::Can | ArmDriver::Franka))?;
     Some(match open::check_motion(rig) {
         Ok(()) => Finding::ok("motion", "[arm.motion] asks for what this kind of arm can do"),
-        Err(error) => {
-            Finding::fail("motion", format!("{error:#}"), "docs/guide/devices.md tells what belongs into [arm.motion]")
-        }
+        Err(error) => Finding::fail(
+            "motion",
+            format!("{error:#}"),
+            "docs/guide/moving-arms.md describes the keys of [arm.motion]",
+        ),
     })
 }
 

@@ -71,7 +71,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let rig = Rig::load(&args.rig_file, &[])?;
     let Some(motion) = rig.arm.motion.as_ref() else {
         return Err(BadArgument(
-            "the rig file has no table [arm.motion], so its arm is only read; docs/reference/rig.md tells its keys".to_owned(),
+            "the rig file has no table [arm.motion], so its arm is only read: see docs/guide/moving-arms.md".to_owned(),
         )
         .into());
     };

@@ -58,7 +58,7 @@ pub(super) fn open(rig: &mut Rig) -> anyhow::Result<Devices> {
 pub(crate) fn movable_arm(rig: &Rig) -> anyhow::Result<Box<dyn MovableArm>> {
     let Some(motion) = &rig.arm.motion else {
         bail!(
-            "the rig file has no table [arm.motion], so its arm is only read: docs/guide/devices.md says what belongs into it"
+            "the rig file has no table [arm.motion], so its arm is only read; docs/guide/moving-arms.md describes the table"
         );
     };
     match rig.arm.driver {
