@@ -1,6 +1,6 @@
 //! Recordings: samples to an MCAP file and back, bit for bit and in the same order.
 //!
-//! Which topic holds what, and why nothing is lost, is told in `docs/reference/recording.md`.
+//! `docs/reference/recording.md` lists the topics and describes what a crash or a full disk leaves readable.
 
 mod reader;
 mod record;

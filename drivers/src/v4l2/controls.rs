@@ -397,7 +397,7 @@ mod tests {
 
     #[test]
     fn a_camera_without_exposure_control_is_not_refused() {
-        // The key then says what is known of it, as docs/reference/rig.md tells.
+        // The key then states what is known about it, as docs/reference/rig.md describes.
         let known = Settings { exposure_micros: Some(4000.0), ..Settings::default() };
         assert_eq!(planned(&known, &VIVID), [(Id::AutoGain, 1)]);
     }
