@@ -40,7 +40,7 @@ fn a_training_that_loses_its_gpu_ends_with_the_bits_of_one_that_does_not() {
     };
     let whole = done(&train("whole", "60", &[]));
     for (name, checkpoint_secs, continues_from) in
-        [("early", "100000", "from the start"), ("late", "0.1", "from the checkpoint of step")]
+        [("early", "100000", "from the start"), ("late", "0.01", "from the checkpoint of step")]
     {
         let lost = train(name, checkpoint_secs, &[("FIELDRIG_TEST_LOSE_GPU_AT_STEP", "150")]);
         let text = stderr(&lost);
@@ -62,7 +62,7 @@ fn where_the_gpu_does_not_come_back_the_checkpoint_and_the_command_that_continue
     let whole = done(&fieldrig(folder, &[&first[..], &["--out", "whole"]].concat(), &[]));
     let env = [("FIELDRIG_TEST_LOSE_GPU_AT_STEP", "150"), ("FIELDRIG_TEST_OPEN_GPU_ONCE", "1")];
 
-    let lost = fieldrig(folder, &[&first[..], &["--out", "lost", "--checkpoint-secs", "0.1"]].concat(), &env);
+    let lost = fieldrig(folder, &[&first[..], &["--out", "lost", "--checkpoint-secs", "0.01"]].concat(), &env);
     let text = stderr(&lost);
     assert_eq!(lost.status.code(), Some(1), "{text}");
     assert!(text.contains("no GPU adapter found") && text.contains("attempt 3 of 3"), "{text}");

@@ -7,7 +7,7 @@ use std::ops::Range;
 use std::panic::AssertUnwindSafe;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::RecvTimeoutError;
-use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError, RwLock};
 use std::time::Duration;
 
 /// How often the device is checked while a read-back has not arrived.
@@ -65,6 +65,8 @@ pub struct Gpu {
     next_id: AtomicU64,
     /// Read-back buffers for reuse, the oldest first.
     idle_staging: Mutex<VecDeque<wgpu::Buffer>>,
+    /// Locked for reading while mapped memory is copied: destroying the device unmaps it.
+    mapped: RwLock<()>,
 }
 
 /// Bytes of the buffers in use.
@@ -223,6 +225,7 @@ impl Gpu {
             peak_bytes: AtomicU64::new(0),
             next_id: AtomicU64::new(0),
             idle_staging: Mutex::default(),
+            mapped: RwLock::default(),
         }))
     }
 
@@ -298,6 +301,8 @@ impl Gpu {
 
     /// Loses the device on purpose, like a driver reset; for tests of recovery.
     pub fn lose(&self) {
+        // A device that fails on its own keeps its mappings; `destroy` removes them at once.
+        let _no_reader = self.mapped.write().unwrap_or_else(PoisonError::into_inner);
         self.device.destroy();
     }
 
@@ -519,12 +524,14 @@ impl PendingRead {
         if !is_mapped {
             return Err(gpu.failure());
         }
+        let reading = gpu.mapped.read().unwrap_or_else(PoisonError::into_inner);
+        gpu.check()?; // Before the mapped memory is touched: a destroyed device has unmapped it.
         let view = staging.get_mapped_range(..).map_err(|_| gpu.failure())?;
-        gpu.check()?;
         let read: Vec<&[u8]> = parts.iter().map(|part| &view[part.clone()]).collect();
         let taken = take(&read);
         drop(read);
         drop(view);
+        drop(reading);
         staging.unmap();
         gpu.keep_staging(staging);
         Ok(taken)
